@@ -1,0 +1,79 @@
+# `make help` lists the targets. Every target prepares .venv first, and again when the requirements change.
+# Options of `train` are variables with the option's name in capitals, passed on only when set:
+#   make train METHOD=fmp RESET=dataset PRESET=laptop SEED=0 MINUTES=30 RUN=runs/walk
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+UV := $(shell command -v uv 2>/dev/null)
+
+# --name 'value' where the variable is set, nothing where it is not.
+option = $(if $($(1)),--$(2) '$($(1))')
+train_options = $(strip \
+  $(call option,METHOD,method) $(call option,RESET,reset) $(call option,PRESET,preset) \
+  $(call option,ROBOT,robot) $(call option,MOTION,motion) $(call option,FRAMES,frames) \
+  $(call option,SEED,seed) $(call option,RUN,run) $(call option,MINUTES,minutes) \
+  $(if $(filter-out 0 no false,$(RESUME)),--resume) $(ARGS))
+
+.PHONY: train evaluate render test test-fast check format build clean help run-is-named
+
+train: $(READY) ## train a policy: METHOD RESET PRESET ROBOT MOTION FRAMES SEED RUN MINUTES RESUME=1
+	$(BIN)/fmpjax train $(train_options)
+
+evaluate: run-is-named $(READY) ## evaluate a run: RUN=runs/walk
+	$(BIN)/fmpjax evaluate '$(RUN)' $(ARGS)
+
+render: run-is-named $(READY) ## render a run's policy as a video: RUN=runs/walk
+	$(BIN)/fmpjax render '$(RUN)' $(ARGS)
+
+test: $(READY) ## run every test
+	$(BIN)/python -m pytest $(ARGS)
+
+test-fast: $(READY) ## run the tests that take seconds
+	$(BIN)/python -m pytest -m 'not slow' $(ARGS)
+
+check: $(READY) ## lint, and check the formatting
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: $(READY) ## format, and fix what the linter can
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
+
+build: $(READY) ## build the source archive and the wheel into dist/
+	$(BIN)/python -m build
+
+clean: ## remove the environment, caches and builds; runs/ stays
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+help: ## show this list
+	@sed -nE 's/^([a-z-]+):[^#]*## (.*)/  \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
+
+run-is-named:
+	@$(if $(RUN),true,echo 'Name the run to read, for example: make $(firstword $(MAKECMDGOALS)) RUN=runs/walk' >&2; exit 2)
+
+# Interpreters are tried by running them: a name on the path may be a shim with no Python of that version behind it.
+$(READY): pyproject.toml constraints.txt
+	@if [ ! -x $(BIN)/python ]; then \
+	  if [ -n '$(UV)' ]; then uv venv --quiet --seed --python '$(or $(PYTHON),>=3.11,<3.14)' $(VENV); \
+	  else \
+	    for python in $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python); do \
+	      if "$$python" -c 'import ensurepip, sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null; \
+	      then found="$$python"; break; fi; \
+	    done; \
+	    if [ -z "$${found:-}" ]; then \
+	      echo 'fmpjax needs uv, or Python 3.11, 3.12 or 3.13 with its venv module, and found neither: install one, or name one with make PYTHON=/path/to/python.' >&2; \
+	      exit 2; \
+	    fi; \
+	    "$$found" -m venv $(VENV); \
+	  fi; \
+	fi
+	@if [ -n '$(UV)' ]; then uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '.[dev,viz]'; \
+	else $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,viz]'; fi
+	@touch $@

@@ -1,0 +1,7 @@
+"""Flow-Matched Motion Priors for humanoid imitation, end to end in JAX."""
+
+__version__ = "0.1.0"
+
+from fmpjax.robots import load as load_robot
+
+__all__ = ["load_robot"]

@@ -1,0 +1,77 @@
+"""Saving and restoring a run's whole state (orbax), atomically.
+
+A checkpoint is a flat mapping from a leaf's path in `TrainState` to its array, so that a file says what it holds and a
+mismatch can be named. Orbax writes to a temporary folder and renames it: a kill leaves the checkpoint before it good.
+"""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from fmpjax.errors import UserError
+from fmpjax.train import TrainState
+
+KEEP = 3  # last checkpoints kept
+
+
+def _flatten(state: TrainState) -> dict[str, jax.Array]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+class Checkpoints:
+    """The checkpoints of one run folder: the last few in ``checkpoints/``, the best one in ``best/``."""
+
+    def __init__(self, run: Path):
+        self.run = Path(run).resolve()
+
+    def _manager(self, kind: str, keep: int) -> ocp.CheckpointManager:
+        options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
+        return ocp.CheckpointManager(self.run / kind, options=options)
+
+    def save(self, state: TrainState, *, best: bool = False) -> None:
+        """Write the state under its iteration's number."""
+        kind, keep = ("best", 1) if best else ("checkpoints", KEEP)
+        with self._manager(kind, keep) as manager:
+            step = int(state.iteration)
+            if step not in manager.all_steps():
+                manager.save(step, args=ocp.args.StandardSave(_flatten(state)), force=True)
+
+    def latest(self, *, best: bool = False) -> int | None:
+        """Iteration of the newest checkpoint, or None."""
+        kind = "best" if best else "checkpoints"
+        steps = [int(p.name) for p in (self.run / kind).glob("*") if p.name.isdigit()]
+        return max(steps, default=None)
+
+    def restore(self, like: TrainState, *, best: bool = False) -> TrainState:
+        """The newest checkpoint, or the best one, in the structure of ``like``.
+
+        Raises:
+          UserError: there is none, it cannot be read, or it is of another configuration.
+        """
+        step = self.latest(best=best)
+        kind = "best" if best else "checkpoints"
+        if step is None:
+            raise UserError(f"run {self.run} has no checkpoint in {kind}/: expected one, train it first")
+        folder = self.run / kind / str(step)
+        try:
+            with ocp.CheckpointManager(self.run / kind) as manager:
+                saved = manager.restore(step, args=ocp.args.StandardRestore())
+        except Exception as error:  # orbax and tensorstore raise many kinds for a damaged folder
+            cause = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
+            raise UserError(f"checkpoint {folder} cannot be read ({cause}): expected a whole checkpoint") from None
+        expected = _flatten(like)
+        if set(saved) != set(expected):
+            name = sorted(set(saved) ^ set(expected))[0]
+            raise UserError(f"checkpoint {folder} is of another configuration: {name} stands in only one of the two")
+        for name, leaf in expected.items():
+            if saved[name].shape != leaf.shape or saved[name].dtype != leaf.dtype:
+                raise UserError(
+                    f"checkpoint {folder} is of another configuration: {name} is {saved[name].dtype}"
+                    f"{list(saved[name].shape)}, expected {leaf.dtype}{list(leaf.shape)}"
+                )
+        leaves = [jnp.asarray(np.asarray(saved[name])) for name in expected]
+        return jax.tree.unflatten(jax.tree.structure(like), leaves)

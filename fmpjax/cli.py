@@ -1,0 +1,182 @@
+"""The command line: ``fmpjax train``, ``evaluate``, ``render``, ``config``."""
+
+import dataclasses
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from fmpjax import config as configuration
+from fmpjax.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train a policy from a demonstration."""
+
+    method: str | None = None
+    """Motion prior, `fmp` by default."""
+    reset: str | None = None
+    """`dataset` (a demonstration state) or `fixed` (the default pose)."""
+    preset: str | None = None
+    """`smoke`, `laptop` (the default on a CPU) or `paper` (the default on an accelerator)."""
+    robot: str | None = None
+    """A robot under robots/, `unitree_g1` by default."""
+    motion: str | None = None
+    """A bundled motion's name, `walk` by default, or a file."""
+    frames: str | None = None
+    """Source rows first:last of the motion, 0-based, both included."""
+    seed: int | None = None
+    """Seed of everything that is random."""
+    transitions: int | None = None
+    """Budget of environment steps."""
+    run: Path | None = None
+    """Folder of the run, runs/METHOD-DATE-TIME by default."""
+    minutes: float | None = None
+    """Time budget: the run ends cleanly and can be resumed."""
+    resume: bool = False
+    """Go on with the run in --run."""
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Any other setting as section.field=value; see `fmpjax config`."""
+
+    def __call__(self) -> None:
+        run = self._open()
+        from fmpjax import runs
+
+        if self.minutes is not None and self.minutes <= 0:
+            raise UserError(f"--minutes is {self.minutes:g}: expected more than 0")
+        finished = runs.train(run, resume=self.resume, minutes=self.minutes)
+        if finished or run.checkpoints.latest(best=True) is not None:
+            for path in runs.finish(run):
+                print(f"wrote {path}")
+
+    def _open(self):
+        from fmpjax import runs
+
+        changes = self._changes()
+        if self.resume:
+            if self.run is None:
+                raise UserError("--resume needs the run's folder: name it with --run")
+            run = runs.Run.open(self.run)
+            saved = configuration.flatten(run.config)
+            if self.preset is not None and self.preset != saved["preset"]:
+                raise UserError(f"run {self.run} has preset {saved['preset']!r}: it cannot go on as {self.preset!r}")
+            asked = configuration.flatten(configuration.with_changes(run.config, changes))
+            for key in changes:
+                if asked[key] != saved[key]:
+                    raise UserError(f"run {self.run} has {key} {saved[key]!r}: it cannot go on with {asked[key]!r}")
+            return run
+        name = self.preset or _default_preset()
+        config = configuration.preset(name, **changes)
+        from fmpjax import priors, robots
+
+        priors.check(config.method)
+        robots.load(config.robot)
+        stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+        return runs.Run.create(self.run or Path("runs") / f"{config.method}-{stamp}", config)
+
+    def _changes(self) -> dict[str, object]:
+        named = {
+            "method": self.method,
+            "env.reset": self.reset,
+            "robot": self.robot,
+            "motion": self.motion,
+            "frames": self.frames,
+            "seed": self.seed,
+            "transitions": self.transitions,
+        }
+        changes = {key: value for key, value in named.items() if value is not None}
+        for item in self.set:
+            key, equals, value = item.partition("=")
+            if not equals:
+                raise UserError(f"--set {item!r}: expected section.field=value")
+            changes[key] = value
+        return changes
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Evaluate a run's best policy on first episodes."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    episodes: int | None = None
+    """First episodes, as many as the run's configuration says by default."""
+    last: bool = False
+    """Take the newest checkpoint in place of the best."""
+
+    def __call__(self) -> None:
+        from fmpjax import runs
+        from fmpjax.evaluate import Evaluator, table
+
+        if self.episodes is not None and self.episodes < 1:
+            raise UserError(f"--episodes is {self.episodes}: expected at least 1")
+        run = runs.Run.open(self.run)
+        trainer, state = run.policy(best=not self.last)
+        print("compiling the evaluation ...", flush=True)
+        evaluation = Evaluator(trainer, self.episodes)(state.ppo)
+        print(f"iteration {int(state.iteration):,}:\n{table(evaluation)}")
+        name = "evaluation-last" if self.last else "evaluation"
+        run.save_evaluation(evaluation, name)
+        print(f"wrote {run.folder / name}.json")
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Render a run's best policy beside the demonstration."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    seconds: float = 10.0
+    """Length at most."""
+    out: Path | None = None
+    """File, RUN/policy.mp4 by default; .gif where no encoder is installed."""
+
+    def __call__(self) -> None:
+        from fmpjax import runs
+        from fmpjax.evaluate import Evaluator
+
+        run = runs.Run.open(self.run)
+        trainer, state = run.policy()
+        print("rolling out and rendering ...", flush=True)
+        played = Evaluator(trainer, 8).play(state.ppo)
+        print(f"wrote {runs.video(run, trainer, played, seconds=self.seconds, path=self.out)}")
+
+
+@dataclasses.dataclass(frozen=True)
+class ShowConfig:
+    """Print every setting of a preset."""
+
+    preset: tyro.conf.Positional[str] = "laptop"
+    """`smoke`, `laptop` or `paper`."""
+
+    def __call__(self) -> None:
+        for key, value in configuration.flatten(configuration.preset(self.preset)).items():
+            print(f"{key} = {value}")
+
+
+def _default_preset() -> str:
+    import jax
+
+    return "laptop" if jax.default_backend() == "cpu" else "paper"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point: bad input is one sentence and exit code 2."""
+    commands = {"train": Train, "evaluate": Evaluate, "render": Render, "config": ShowConfig}
+    command = tyro.extras.subcommand_cli_from_dict(
+        commands, prog="fmpjax", description="Flow-Matched Motion Priors in JAX.", args=arguments
+    )
+    try:
+        command()
+    except UserError as error:
+        print(f"fmpjax: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,316 @@
+"""Every number of the method, once, with its source.
+
+Sources: [P] the paper; [M] MimicKit, the code base the paper builds on; [D] decided here where both are silent. The
+defaults of the dataclasses are the paper's; `PRESETS` says where ``smoke`` and ``laptop`` depart from them and why.
+"""
+
+import dataclasses
+import difflib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from fmpjax.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class PhysicsConfig:
+    """Simulation between two control steps."""
+
+    backend: str = "auto"  # "native" (MuJoCo C on all cores), "mjx" (on the device), "auto": mjx on an accelerator [D]
+    impl: str = "jax"  # implementation of MJX, "jax" or "warp" (NVIDIA only) [D]
+    timestep: float = 0.005  # s, 200 Hz [D]
+    substeps: int = 4  # physics steps in a control step, 50 Hz control [P]
+    iterations: int = 10  # Newton iterations at most [D]
+    ls_iterations: int = 20  # line-search iterations at most [D]
+    frictionloss: float = 0.1  # N m, joint friction [M]
+    threads: int = 0  # threads of the native backend, 0 for every core [D]
+    max_contacts: int = 48  # contacts of one world in the buffers of impl="warp" [D]
+    max_constraints: int = 256  # constraint rows of one world in the buffers of impl="warp" [D]
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvConfig:
+    """Environments, episodes and resets."""
+
+    count: int = 1024  # parallel environments [P]
+    reset: str = "dataset"  # "dataset" (a demonstration state) or "fixed" (the default pose) [P]
+    episode_steps: int = 500  # control steps, 10 s [P]
+    first_cap: int = 500  # the episode cap at the start; below episode_steps it grows as episodes survive [P: no growth]
+    cap_growth: float = 1.25  # factor of a growth step [D]
+    cap_share: float = 0.75  # share of episodes that end by the cap above which the cap grows [D]
+    cap_patience: int = 25  # rollouts between two growth steps at least [D]
+    observation: str = "full"  # "full": 237 numbers [P]; "compact": 86 that carry the same information [D]
+    action: str = "absolute"  # "absolute": 1.4 max|limit| around zero [M]; "residual": 0.25 effort/kp around the mean [D]
+
+
+@dataclasses.dataclass(frozen=True)
+class FeatureConfig:
+    """Window features of the prior."""
+
+    history: int = 10  # frames in a window, H [P]
+    deviation_floor: float = 1e-4  # least standard deviation of a coordinate when standardising [M]
+    clip: float = 10.0  # standardised coordinates are clipped to this magnitude [P]
+
+
+@dataclasses.dataclass(frozen=True)
+class PriorConfig:
+    """The transport potential and its fitting, sections III-B to III-D of the paper."""
+
+    bank: int = 256  # windows in the expert bank and in a source bank, m = n [P]
+    minibatch: int = 256  # queries of an update [P]
+    updates: int = 128  # reward-model updates in a rollout [P]
+    query_share: float = 0.75  # the first environments, 0-767 of 1,024, supply queries [P]
+    query_is_bank: bool = False  # queries are the source bank itself, which saves two cost matrices [P: no]
+    hidden: tuple[int, ...] = (256, 256)  # trunk layers [P]
+    learning_rate: float = 3e-4  # Adam [P]
+    clip_norm: float = 10.0  # gradient-norm clip [P]
+    average_half_life: float = 16.0  # updates, half-life of the parameter average within a rollout [P]
+    value_scale: float = 0.10  # c0 of the value loss, eq. (value) [P]
+    value_weight: float = 1.0  # [P]
+    endpoint_weight: float = 1.0  # [P]
+    flow_weight: float = 1.0  # [P]
+    epsilon_fraction: float = 0.1  # entropy over the median cross cost [P]
+    sinkhorn_threshold: float = 1e-3  # marginal error (L1) at which a solve has converged [D]
+    sinkhorn_iterations: int = 200  # at most; what has not converged by then is counted [D]
+    spread_floor: float = 1e-6  # eta, least interquartile range in the reward [D]
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig:
+    """Policy optimisation, section IV-A of the paper."""
+
+    rollout_steps: int = 32  # control steps in a rollout [P]
+    hidden: tuple[int, ...] = (1024, 512)  # actor and critic layers, separate networks [M]
+    activation: str = "relu"  # [M]
+    mean_init: float = 0.01  # actor's mean weights are uniform in this range [M]
+    orthogonal: bool = False  # orthogonal weights in place of LeCun's [M: no]
+    deviation: float = 0.05  # standard deviation in normalised actions at the start [M]
+    learn_deviation: bool = False  # learn it, one number a joint [M: fixed]
+    least_deviation: float = 0.05  # floor of a learned deviation [D]
+    optimizer: str = "sgd"  # "sgd" or "adam" [M]
+    learning_rate: float = 1e-4  # [P]
+    momentum: float = 0.9  # of SGD [M]
+    clip_norm: float = 0.0  # gradient-norm clip, 0 for none [M]
+    target_kl: float = 0.0  # 0 keeps the rate; else it falls above and rises below, see `ppo.adapt_rate` [M: 0]
+    critic_epochs: int = 2  # [M]
+    critic_batch: int = 2  # samples an environment in a minibatch [M]
+    actor_epochs: int = 5  # [M]
+    actor_batch: int = 4  # [M]
+    discount: float = 0.99  # gamma [P]
+    gae_lambda: float = 0.95  # [P]
+    clip: float = 0.2  # probability-ratio clip [P]
+    advantage_clip: float = 4.0  # normalised advantages are clipped to this magnitude [M]
+    bound_penalty: float = 10.0  # weight of sum max(|mean| - 1, 0)^2 [M]
+    normalizer_clip: float = 10.0  # normalised observations are clipped to this magnitude [M]
+    normalizer_floor: float = 1e-4  # least standard deviation of an observation [M]
+    normalizer_from_clip: bool = False  # start the running statistics from the demonstration [M: no]
+    normalizer_count: int = 0  # cap of the running count, which then forgets slowly; 0 for none [M: 0]
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """One run."""
+
+    method: str = "fmp"
+    robot: str = "unitree_g1"
+    motion: str = "walk"  # a bundled motion's name or a file
+    frames: str = ""  # source rows "first:last" of the motion, both included; empty for all
+    preset: str = "paper"
+    seed: int = 0
+    transitions: int = 50_003_968  # budget [P]
+    evaluations: tuple[float, ...] = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)  # shares of the budget at which to evaluate [P]
+    evaluation_episodes: int = 1024  # first episodes of an evaluation [P]
+    chunk: int = 14  # iterations in one call of the compiled program; 1,526 rollouts are 109 calls [D]
+    nonfinite_limit: int = 1000  # environments reset or updates skipped for non-finite numbers before a run stops [D]
+    physics: PhysicsConfig = PhysicsConfig()
+    env: EnvConfig = EnvConfig()
+    features: FeatureConfig = FeatureConfig()
+    prior: PriorConfig = PriorConfig()
+    ppo: PPOConfig = PPOConfig()
+
+    @property
+    def transitions_per_iteration(self) -> int:
+        return self.env.count * self.ppo.rollout_steps
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of the budget, rounded up to whole calls of the compiled program."""
+        call = self.transitions_per_iteration * self.chunk
+        return -(-self.transitions // call) * self.chunk
+
+    @property
+    def control_rate(self) -> float:
+        """Control steps a second, Hz."""
+        return 1.0 / (self.physics.timestep * self.physics.substeps)
+
+
+# What walks on two cores in half an hour. Each departure from the paper, and why:
+# - physics at 100 Hz without joint friction, five Newton iterations: three times the paper's rate on a CPU;
+# - an episode cap that grows from 64 steps: with 500 from the start the policy learns to stand;
+# - discount 0.97: a median-centred reward pays one a step for mere survival, worth 1/(1 - gamma);
+# - three reward updates a rollout of 4,096: the reward changes little between so small rollouts;
+# - feature deviations floored at 0.05: coordinates that the demonstration hardly moves would carry the distance;
+# - Adam with a rate that follows the KL divergence, small networks, learned deviation: sample efficiency.
+_LAPTOP: dict[str, Any] = {
+    "transitions": 7_700_000,
+    "evaluations": (0.25, 0.5, 0.75, 1.0),
+    "evaluation_episodes": 256,
+    "chunk": 25,
+    "physics.timestep": 0.01,
+    "physics.substeps": 2,
+    "physics.iterations": 5,
+    "physics.ls_iterations": 5,
+    "physics.frictionloss": 0.0,
+    "env.count": 128,
+    "env.first_cap": 64,
+    "env.observation": "compact",
+    "env.action": "residual",
+    "features.deviation_floor": 0.05,
+    "prior.updates": 3,
+    "prior.query_share": 1.0,
+    "prior.query_is_bank": True,
+    "prior.spread_floor": 1e-3,
+    "ppo.hidden": (256, 128),
+    "ppo.activation": "elu",
+    "ppo.orthogonal": True,
+    "ppo.deviation": 0.35,
+    "ppo.learn_deviation": True,
+    "ppo.optimizer": "adam",
+    "ppo.learning_rate": 5e-4,
+    "ppo.clip_norm": 1.0,
+    "ppo.target_kl": 0.03,
+    "ppo.critic_epochs": 5,
+    "ppo.critic_batch": 8,
+    "ppo.actor_epochs": 5,
+    "ppo.actor_batch": 8,
+    "ppo.discount": 0.97,
+    "ppo.bound_penalty": 0.0,
+    "ppo.normalizer_from_clip": True,
+    "ppo.normalizer_count": 2_000_000,
+}
+
+# The whole path, small: nothing is learned, everything runs.
+_SMOKE: dict[str, Any] = _LAPTOP | {
+    "transitions": 16 * 32 * 20,
+    "evaluations": (0.5, 1.0),
+    "evaluation_episodes": 8,
+    "chunk": 5,
+    "env.count": 16,
+    "prior.bank": 64,
+    "prior.minibatch": 64,
+    "prior.updates": 2,
+    "ppo.hidden": (64, 64),
+}
+
+PRESETS: Mapping[str, Mapping[str, Any]] = {"smoke": _SMOKE, "laptop": _LAPTOP, "paper": {}}
+
+
+def preset(name: str, **changes: Any) -> Config:
+    """A preset's configuration with changes, given as ``section.field`` keys.
+
+    Raises:
+      UserError: unknown preset or field, or a value of the wrong type.
+    """
+    if name not in PRESETS:
+        raise UserError(f"unknown preset {name!r}: expected one of {', '.join(PRESETS)}")
+    return validate(with_changes(Config(preset=name), {**PRESETS[name], **changes}))
+
+
+def with_changes(config: Config, changes: Mapping[str, Any]) -> Config:
+    """``config`` with ``section.field`` or ``field`` keys replaced; strings are read as the field's type."""
+    for key, value in changes.items():
+        section, _, field = key.rpartition(".")
+        target = getattr(config, section, None) if section else config
+        names = [f.name for f in dataclasses.fields(target)] if dataclasses.is_dataclass(target) else []
+        if field not in names or dataclasses.is_dataclass(getattr(target, field)):
+            known = list(flatten(config))
+            close = difflib.get_close_matches(key, known, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else "see `fmpjax config` for all of them"
+            raise UserError(f"unknown setting {key!r}: {hint}")
+        value = _convert(key, value, getattr(target, field))
+        target = dataclasses.replace(target, **{field: value})
+        config = dataclasses.replace(config, **{section: target}) if section else target
+    return config
+
+
+def _convert(key: str, value: Any, like: Any) -> Any:
+    kind = type(like)
+    try:
+        if kind is tuple:
+            items = value.strip("()[] ").split(",") if isinstance(value, str) else value
+            return tuple(type(like[0])(item) for item in items if item != "")
+        if kind is bool and isinstance(value, str):
+            return {"true": True, "1": True, "false": False, "0": False}[value.lower()]
+        if kind is int and isinstance(value, str):
+            return int(value.replace("_", ""))
+        if kind is int and (isinstance(value, bool) or value != int(value)):
+            raise ValueError
+        return kind(value)
+    except (ValueError, TypeError, KeyError):
+        raise UserError(f"setting {key} is {value!r}: expected {kind.__name__} such as {like!r}") from None
+
+
+def flatten(config: Config) -> dict[str, Any]:
+    """All settings by ``section.field`` key."""
+    flat = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            flat |= {f"{field.name}.{f.name}": getattr(value, f.name) for f in dataclasses.fields(value)}
+        else:
+            flat[field.name] = value
+    return flat
+
+
+def to_json(config: Config) -> str:
+    return json.dumps(flatten(config), indent=1)
+
+
+def from_json(text: str) -> Config:
+    return validate(with_changes(Config(), json.loads(text)))
+
+
+_CHOICES = {
+    "env.reset": ("dataset", "fixed"),
+    "env.observation": ("full", "compact"),
+    "env.action": ("absolute", "residual"),
+    "physics.backend": ("auto", "native", "mjx"),
+    "physics.impl": ("jax", "warp"),
+    "ppo.optimizer": ("sgd", "adam"),
+    "ppo.activation": ("relu", "elu", "swish", "tanh"),
+}
+_POSITIVE = (
+    "transitions env.count env.episode_steps env.first_cap ppo.rollout_steps physics.timestep physics.substeps "
+    "features.deviation_floor features.clip prior.bank prior.minibatch prior.updates prior.learning_rate "
+    "ppo.learning_rate ppo.deviation chunk evaluation_episodes prior.spread_floor prior.value_scale"
+).split()
+
+
+def validate(config: Config) -> Config:
+    """The configuration itself, or a `UserError` naming the first setting that cannot be."""
+    flat = flatten(config)
+    for key, allowed in _CHOICES.items():
+        if flat[key] not in allowed:
+            raise UserError(f"unknown {key.rpartition('.')[2]} {flat[key]!r}: expected one of {', '.join(allowed)}")
+    for key in _POSITIVE:
+        if not flat[key] > 0:
+            raise UserError(f"setting {key} is {flat[key]}: expected more than 0")
+    for key in ("ppo.discount", "ppo.gae_lambda", "prior.query_share"):
+        if not 0 < flat[key] <= 1:
+            raise UserError(f"setting {key} is {flat[key]}: expected a number in (0, 1]")
+    if not 2 <= config.features.history <= 64:
+        raise UserError(f"setting features.history is {config.features.history}: expected 2 to 64 frames")
+    if config.prior.query_is_bank and config.prior.minibatch != config.prior.bank:
+        raise UserError(
+            f"setting prior.minibatch is {config.prior.minibatch}: expected prior.bank, {config.prior.bank}, "
+            "since prior.query_is_bank makes the source bank the minibatch"
+        )
+    for phase in ("critic", "actor"):
+        batch = flat[f"ppo.{phase}_batch"]
+        if batch < 1 or config.ppo.rollout_steps % batch:
+            raise UserError(
+                f"setting ppo.{phase}_batch is {batch}: expected a divisor of ppo.rollout_steps, "
+                f"{config.ppo.rollout_steps}, so that minibatches are equal"
+            )
+    return config

@@ -1,0 +1,240 @@
+"""Parallel environments: resets, falls, time-outs, and the frames that the prior's windows are made of.
+
+Windows are kept as indices. A rollout stores one compact frame a step; a window is H indices into the table
+``[demonstration frames | default-pose frame | frames before the rollout | frames of the rollout]``. After a reset the
+indices point at the demonstration's own preceding frames, or repeat the default pose, so a history is right by
+construction.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fmpjax import features, physics
+from fmpjax.config import Config
+from fmpjax.features import Observed
+from fmpjax.motion import MotionClip
+from fmpjax.robots import Robot
+
+# Faster than any joint or fall of a robot of this size, rad/s or m/s: such a state has blown up.
+_VELOCITY_LIMIT = 1e3
+
+
+class Offender(NamedTuple):
+    """The last state from which the physics left the finite numbers, kept to be looked at."""
+
+    qpos: jax.Array  # [7 + J]
+    qvel: jax.Array  # [6 + J]
+    action: jax.Array  # [J] normalised
+
+
+class EnvState(NamedTuple):
+    """State of N environments; all of it is checkpointed."""
+
+    physics: physics.PhysicsState
+    observed: Observed  # of the present state
+    history: jax.Array  # [N, H, F] frames up to the present one, oldest first
+    age: jax.Array  # [N] int32, steps since the reset
+    cap: jax.Array  # scalar, steps at which an episode times out
+    capped_share: jax.Array  # scalar, running share of episodes that end by the cap
+    cap_age: jax.Array  # scalar int32, rollouts since the cap last grew
+    offender: Offender
+
+
+class Steps(NamedTuple):
+    """A rollout: T steps of N environments."""
+
+    observation: jax.Array  # [T, N, O] before the action
+    next_observation: jax.Array  # [T, N, O] after it, before any reset: the true one
+    action: jax.Array  # [T, N, J] normalised
+    extras: dict[str, jax.Array]  # what the policy said of the action, each [T, N, ...]
+    fell: jax.Array  # [T, N] bool
+    timed_out: jax.Array  # [T, N] bool; a fall on the same step is a fall
+    nonfinite: jax.Array  # [T, N] bool, a fall for whoever learns
+    length: jax.Array  # [T, N] int32, steps of the episode up to and including this one
+    frame: jax.Array  # [T, N, F] compact frame after the step, before any reset
+    window: jax.Array  # [T, N, H] int32 indices into the frame table
+
+
+# observation, key -> normalised action [N, J] and what to remember of it
+PolicyFn = Callable[[jax.Array, jax.Array], tuple[jax.Array, dict[str, jax.Array]]]
+
+
+class ActionMap(NamedTuple):
+    """Joint targets (rad) from normalised actions: clip(center + scale * a, low, high); each ``[J]``."""
+
+    center: np.ndarray
+    scale: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def __call__(self, action: jax.Array) -> jax.Array:
+        return jnp.clip(self.center + self.scale * action, self.low, self.high).astype(action.dtype)
+
+
+def action_map(robot: Robot, clip: MotionClip, kind: str) -> ActionMap:
+    """The ``absolute`` map around zero, or the ``residual`` map around the demonstration's mean pose."""
+    if kind == "absolute":
+        scale = 1.4 * np.maximum(np.abs(robot.joint_low), np.abs(robot.joint_high))
+        return ActionMap(np.zeros_like(scale), scale, -scale, scale)
+    return ActionMap(
+        center=clip.qpos[:, 7:].mean(0),
+        scale=0.25 * robot.effort / robot.stiffness,
+        low=robot.joint_low - 0.3,
+        high=robot.joint_high + 0.3,
+    )
+
+
+class Env:
+    """Environments of one robot and demonstration; its methods are pure."""
+
+    def __init__(self, robot: Robot, clip: MotionClip, config: Config, backend: physics.Physics):
+        self.robot, self.config, self.physics = robot, config.env, backend
+        self.horizon = config.features.history
+        self.actions = action_map(robot, clip, config.env.action)
+        observe = jax.jit(lambda qpos, qvel: features.observe(robot, qpos, qvel, config.env.observation))
+        self._observe = observe
+        # Rows 0..M-1 are the demonstration, row M the default pose; resets gather from here.
+        self._qpos = np.concatenate([clip.qpos, robot.default_qpos[None]]).astype(np.float32)
+        self._qvel = np.concatenate([clip.qvel, np.zeros_like(clip.qvel[:1])]).astype(np.float32)
+        self._table = jax.tree.map(np.asarray, observe(jnp.asarray(self._qpos), jnp.asarray(self._qvel)))
+        self.clip_length = len(clip.qpos)
+
+    @property
+    def observation_size(self) -> int:
+        return self._table.actor.shape[-1]
+
+    @property
+    def clip_observations(self) -> np.ndarray:
+        """Policy observations of the demonstration, ``[M, O]``."""
+        return self._table.actor[:-1]
+
+    def clip_windows(self) -> jax.Array:
+        """The demonstration's windows of compact frames, ``[M - H + 1, H, F]``."""
+        starts = np.arange(self.clip_length - self.horizon + 1)
+        return jnp.asarray(self._table.frame)[starts[:, None] + np.arange(self.horizon)]
+
+    def reset_rows(self, key: jax.Array, count: int) -> jax.Array:
+        """Table rows ``[count]`` at which episodes start under the configured regime."""
+        if self.config.reset == "fixed":
+            return jnp.full((count,), self.clip_length)
+        return jax.random.randint(key, (count,), self.horizon - 1, self.clip_length)
+
+    def history_rows(self, rows: jax.Array) -> jax.Array:
+        """Table rows ``[count, H]`` of the histories that end at ``rows``."""
+        before = rows[:, None] - np.arange(self.horizon)[::-1]
+        return jnp.where(rows[:, None] == self.clip_length, rows[:, None], before)
+
+    def start_at(self, rows: jax.Array) -> EnvState:
+        """Environments at the table rows ``[N]``, episodes beginning."""
+        table = jax.tree.map(jnp.asarray, self._table)
+        state = physics.reset(jnp.asarray(self._qpos)[rows], jnp.asarray(self._qvel)[rows])
+        return EnvState(
+            physics=state,
+            observed=jax.tree.map(lambda x: x[rows], table),
+            history=table.frame[self.history_rows(rows)],
+            age=jnp.zeros(len(rows), jnp.int32),
+            cap=jnp.float32(self.config.first_cap),
+            capped_share=jnp.float32(0.0),
+            cap_age=jnp.int32(0),
+            offender=Offender(*(jnp.zeros(n) for n in (state.qpos.shape[-1], state.qvel.shape[-1], len(self.actions.low)))),
+        )
+
+    def reset(self, key: jax.Array) -> EnvState:
+        """All environments at fresh resets."""
+        return self.start_at(self.reset_rows(key, self.config.count))
+
+    def rollout(self, state: EnvState, policy: PolicyFn, key: jax.Array, steps: int) -> tuple[EnvState, Steps]:
+        """``steps`` control steps under a policy; falls and time-outs reset at once."""
+        count = len(state.age)
+        table = jax.tree.map(jnp.asarray, self._table)
+        qpos, qvel = jnp.asarray(self._qpos), jnp.asarray(self._qvel)
+        before = self.clip_length + 1  # rows ahead of the frames before the rollout
+        during = before + count * self.horizon  # rows ahead of the rollout's own frames
+
+        def step(carry, inputs):
+            sim, observed, age, window, offender = carry
+            index, key = inputs
+            policy_key, reset_key = jax.random.split(key)
+            action, extras = policy(observed.actor, policy_key)
+            before_step = sim
+            sim, reached, fell, finite = self._advance(sim, action)
+            first = jnp.argmin(finite)
+            here = Offender(before_step.qpos[first], before_step.qvel[first], action[first])
+            offender = jax.tree.map(lambda new, old: jnp.where(finite.all(), old, new), here, offender)
+            age = age + 1
+            timed_out = (age >= state.cap) & ~fell
+            rows = during + index * count + jnp.arange(count)
+            window = jnp.concatenate([window[:, 1:], rows[:, None]], axis=1)
+            record = Steps(
+                observation=observed.actor,
+                next_observation=reached.actor,
+                action=action,
+                extras=extras,
+                fell=fell,
+                timed_out=timed_out,
+                nonfinite=~finite,
+                length=age,
+                frame=reached.frame,
+                window=window,
+            )
+            done = fell | timed_out
+            start = self.reset_rows(reset_key, count)
+
+            def choose(fresh, old):
+                return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), fresh, old)
+
+            sim = jax.tree.map(choose, physics.reset(qpos[start], qvel[start]), sim)
+            observed = jax.tree.map(lambda t, o: choose(t[start], o), table, reached)
+            carry = (sim, observed, choose(jnp.zeros_like(age), age), choose(self.history_rows(start), window), offender)
+            return carry, record
+
+        window = before + jnp.arange(count * self.horizon).reshape(count, self.horizon)
+        (sim, observed, age, window, offender), record = jax.lax.scan(
+            step,
+            (state.physics, state.observed, state.age, window, state.offender),
+            (jnp.arange(steps), jax.random.split(key, steps)),
+        )
+        history = self.frame_table(state, record)[window]
+        new_state = state._replace(physics=sim, observed=observed, history=history, age=age, offender=offender)
+        return self._grow_cap(new_state, record), record
+
+    def advance(self, sim: physics.PhysicsState, action: jax.Array):
+        """One control step without resets: the state reached, what is observed of it, and who fell, ``[N]``."""
+        return self._advance(sim, action)[:3]
+
+    def _advance(self, sim, action):
+        sim = self.physics.step(sim, self.actions(action))
+        finite = _finite(sim)
+        # Non-finite numbers must not reach the observation, not even to be discarded.
+        sim = jax.tree.map(lambda x: jnp.where(finite[:, None], x, 0.0), sim)
+        observed = self._observe(sim.qpos, sim.qvel)
+        return sim, observed, observed.fallen | ~finite, finite
+
+    def frame_table(self, state: EnvState, record: Steps) -> jax.Array:
+        """Frames ``[rows, F]`` that the windows of a rollout begun in ``state`` index."""
+        size = record.frame.shape[-1]
+        return jnp.concatenate(
+            [jnp.asarray(self._table.frame), state.history.reshape(-1, size), record.frame.reshape(-1, size)]
+        )
+
+    def _grow_cap(self, state: EnvState, record: Steps) -> EnvState:
+        """Raise the cap when episodes survive it (none where it starts at the full length)."""
+        config = self.config
+        ended, capped = (record.fell | record.timed_out).sum(), record.timed_out.sum()
+        share = jnp.where(
+            ended > 0, 0.9 * state.capped_share + 0.1 * capped / jnp.maximum(ended, 1), state.capped_share
+        )
+        cap_age = state.cap_age + 1
+        grow = (share > config.cap_share) & (cap_age >= config.cap_patience) & (state.cap < config.episode_steps)
+        cap = jnp.where(grow, jnp.minimum(jnp.ceil(state.cap * config.cap_growth), config.episode_steps), state.cap)
+        return state._replace(cap=cap, capped_share=share, cap_age=jnp.where(grow, 0, cap_age))
+
+
+def _finite(sim: physics.PhysicsState) -> jax.Array:
+    """Whether each environment's state is finite and has not blown up, ``[N]`` bool."""
+    sane = jnp.isfinite(sim.qpos).all(-1) & jnp.isfinite(sim.warmstart).all(-1)
+    return sane & (jnp.abs(sim.qvel) < _VELOCITY_LIMIT).all(-1)

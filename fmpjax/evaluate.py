@@ -1,0 +1,224 @@
+"""Evaluation of a frozen policy on first episodes (section IV-C of the paper)."""
+
+import dataclasses
+import json
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from ott.geometry import geometry
+from ott.tools import sinkhorn_divergence
+
+from fmpjax import features, kinematics, metrics, rotations, transport
+from fmpjax.ppo import PPOState
+from fmpjax.train import Trainer
+
+DETAILED = 64  # episodes whose joints and feet are analysed [P]
+WINDOWS = 512  # windows at most on either side of the Sinkhorn discrepancy [D]
+CONTACT_HEIGHT = 0.01  # m, a foot is in contact where a sole point is lower [D]
+
+
+class Episodes(NamedTuple):
+    """First episodes of N environments over T steps; after a fall the state stands still."""
+
+    qpos: np.ndarray  # [T, N, 7 + J]
+    qvel: np.ndarray  # [T, N, 6 + J]
+    length: np.ndarray  # [N] steps survived
+    fell: np.ndarray  # [N] bool
+    start_qpos: np.ndarray  # [N, 7 + J]
+    history: np.ndarray  # [N, H, F] compact frames up to the start
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """The evaluation's figures; `as_dict` names them as the metrics files do."""
+
+    episodes: int
+    falls: int
+    mean_length: float  # steps
+    late_speed: float  # m/s
+    late_n: int  # episodes behind the late speed
+    late_deviation: float  # m/s, between episodes
+    excursion: float
+    excursion_n: int
+    amplitude_mae: float  # degrees
+    sinkhorn: float
+    contact_foot_speed: float  # m/s
+    imbalance: float
+    displacement: float  # m
+    demonstration_speed: float  # m/s
+    joint_ranges: tuple[float, ...]  # degrees, six sagittal joints
+    expert_ranges: tuple[float, ...]  # degrees
+
+    @property
+    def quality(self) -> float:
+        """Share of surviving episodes times late speed over the demonstration's (at most 1): what "best" means."""
+        speed = 0.0 if np.isnan(self.late_speed) else self.late_speed / max(self.demonstration_speed, 1e-6)
+        return (1.0 - self.falls / self.episodes) * float(np.clip(speed, 0.0, 1.0))
+
+    def as_dict(self) -> dict[str, float]:
+        """Scalar figures, by name."""
+        values = dataclasses.asdict(self) | {"quality": self.quality}
+        return {name: value for name, value in values.items() if not isinstance(value, tuple)}
+
+    def to_json(self) -> str:
+        """All figures; what is not defined is null."""
+        values = dataclasses.asdict(self) | {"quality": self.quality}
+        return json.dumps({k: None if isinstance(v, float) and np.isnan(v) else v for k, v in values.items()}, indent=1)
+
+
+class Evaluator:
+    """First episodes of a trainer's environments under a deterministic policy, compiled once."""
+
+    def __init__(self, trainer: Trainer, episodes: int | None = None, seed: int = 1):
+        self.trainer = trainer
+        self.count = episodes or trainer.config.evaluation_episodes
+        # Matched resets: every evaluation of a configuration starts from the same states.
+        self.rows = np.asarray(trainer.env.reset_rows(jax.random.PRNGKey(seed), self.count))
+
+    @partial(jax.jit, static_argnums=0)
+    def _play(self, state: PPOState):
+        env = self.trainer.env
+        start = env.start_at(jnp.asarray(self.rows))
+        policy = self.trainer.ppo.act(state, deterministic=True)
+
+        def step(carry, _):
+            sim, observed, alive, length = carry
+            action, _ = policy(observed.actor, None)
+            reached, observation, fell = env.advance(sim, action)
+            still_alive = alive & ~fell
+            length = length + alive
+
+            def hold(new, old):
+                # The step on which a robot falls is part of its episode; after it nothing moves.
+                return jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+            sim = jax.tree.map(hold, reached, sim)
+            observed = jax.tree.map(hold, observation, observed)
+            return (sim, observed, still_alive, length), (sim.qpos, sim.qvel)
+
+        alive = jnp.ones(self.count, bool)
+        carry, (qpos, qvel) = jax.lax.scan(
+            step,
+            (start.physics, start.observed, alive, jnp.zeros(self.count, jnp.int32)),
+            None,
+            length=env.config.episode_steps,
+        )
+        return qpos, qvel, carry[3], ~carry[2], start.physics.qpos, start.history
+
+    def play(self, state: PPOState) -> Episodes:
+        """First episodes under ``state``'s mean action."""
+        return Episodes(*map(np.asarray, self._play(state)))
+
+    def __call__(self, state: PPOState) -> Evaluation:
+        return self.measure(self.play(state))
+
+    def measure(self, played: Episodes) -> Evaluation:
+        """The figures of played episodes."""
+        trainer, robot, clip = self.trainer, self.trainer.robot, self.trainer.clip
+        rate = trainer.config.control_rate
+        heading = rotations.yaw(played.start_qpos[:, 3:7].astype(np.float64))
+        root = played.qpos[..., :3].astype(np.float64)
+        speed = metrics.late_speed(root, played.length, heading, rate=rate)
+        displacement = metrics.forward_displacement(root, played.length, heading, played.start_qpos[:, :3])
+
+        detail = slice(0, min(DETAILED, self.count))
+        length = played.length[detail]
+        joints = played.qpos[:, detail, 7:].astype(np.float64)
+        ranges = metrics.window_ranges(joints, length, robot.sagittal_joints, rate=rate)
+        expert = metrics.expert_ranges(clip.qpos[:, 7:], robot.sagittal_joints, rate=rate)
+        excursion = metrics.summarise(metrics.excursion(ranges, expert))
+        feet, contact = self._feet(jnp.asarray(played.qpos[:, detail]))
+        late = metrics.summarise(speed)
+        planar = np.diff(clip.qpos[:, :2], axis=0)
+        return Evaluation(
+            episodes=self.count,
+            falls=int(played.fell.sum()),
+            mean_length=float(played.length.mean()),
+            late_speed=late.mean,
+            late_n=late.n,
+            late_deviation=float(np.nanstd(speed)) if late.n else float("nan"),
+            excursion=excursion.mean,
+            excursion_n=excursion.n,
+            amplitude_mae=metrics.summarise(metrics.amplitude_mae(ranges, expert)).mean,
+            sinkhorn=self._sinkhorn(played, detail),
+            contact_foot_speed=metrics.summarise(
+                metrics.contact_foot_speed(feet, contact, length, rate=rate)
+            ).mean,
+            imbalance=metrics.summarise(metrics.left_right_imbalance(ranges)).mean,
+            displacement=metrics.summarise(displacement).mean,
+            demonstration_speed=float(np.linalg.norm(planar, axis=-1).mean() * clip.rate),
+            joint_ranges=tuple(np.degrees(_finite_mean(ranges)).round(2).tolist()),
+            expert_ranges=tuple(np.degrees(expert).round(2).tolist()),
+        )
+
+    def _feet(self, qpos: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+        """Foot positions ``[T, n, F, 3]`` (m, the mean of a foot's sole points) and contacts ``[T, n, F]``."""
+        robot = self.trainer.robot
+        poses = jax.jit(partial(kinematics.body_poses, robot))(qpos)
+        soles = kinematics.points(poses, robot.sole_body, robot.sole_point)
+        heights = kinematics.sole_heights(robot, poses)
+        feet = np.unique(robot.sole_body)
+        position = np.stack([np.asarray(soles[..., robot.sole_body == f, :].mean(-2)) for f in feet], axis=-2)
+        contact = np.stack([np.asarray(heights[..., robot.sole_body == f].min(-1)) for f in feet], axis=-1)
+        return position, contact < CONTACT_HEIGHT
+
+    def _sinkhorn(self, played: Episodes, detail: slice) -> float:
+        """Debiased Sinkhorn discrepancy between evaluation and expert windows in the fixed features."""
+        trainer = self.trainer
+        horizon = trainer.env.horizon
+        qpos, qvel = jnp.asarray(played.qpos[:, detail]), jnp.asarray(played.qvel[:, detail])
+        frames = jax.jit(lambda q, v: features.observe(trainer.robot, q, v, "compact").frame)(qpos, qvel)
+        frames = np.concatenate([np.swapaxes(played.history[detail], 0, 1), np.asarray(frames)])  # [H + T, n, F]
+        steps, episodes = np.nonzero(np.arange(len(played.qpos))[:, None] < played.length[detail])
+        # Evenly spaced samples in a fixed shuffled order: the same windows for the same lengths.
+        pick = np.random.default_rng(0).permutation(len(steps))[:WINDOWS]
+        rows = steps[pick, None] + 1 + np.arange(horizon)
+        evaluated = trainer.feature_map(jnp.asarray(frames[rows, episodes[pick, None]]))
+        expert = trainer.expert_features[:: max(1, len(trainer.expert_features) // WINDOWS)]
+        return float(discrepancy(evaluated, expert, trainer.feature_map.dimension))
+
+
+@jax.jit
+def discrepancy(x: jax.Array, y: jax.Array, dimension: jax.Array) -> jax.Array:
+    """Debiased Sinkhorn divergence between features ``x [n, D]`` and ``y [m, D]``, at the cross cost's epsilon."""
+    cross = transport.squared_cost(x, y)
+    epsilon = transport.entropy_coefficient(cross, dimension)
+    value, _ = sinkhorn_divergence.sinkhorn_divergence(
+        geometry.Geometry,
+        cross,
+        transport.squared_cost(x, x),
+        transport.squared_cost(y, y),
+        epsilon=epsilon,
+        solve_kwargs={"threshold": 1e-4, "max_iterations": 2000},
+    )
+    return value
+
+
+def _finite_mean(ranges: np.ndarray) -> np.ndarray:
+    """Mean of ``ranges [W, N, 6]`` over windows and episodes that have them, ``[6]``."""
+    flat = ranges.reshape(-1, ranges.shape[-1])
+    kept = flat[np.isfinite(flat).all(-1)]
+    return kept.mean(0) if len(kept) else np.full(ranges.shape[-1], np.nan)
+
+
+def table(evaluation: Evaluation) -> str:
+    """The figures as a table for people."""
+    e = evaluation
+    rows = [
+        ("mean episode length", f"{e.mean_length:.1f}", "steps"),
+        ("falls", f"{e.falls} of {e.episodes}", ""),
+        ("late forward speed", f"{e.late_speed:.3f} ± {e.late_deviation:.3f}", f"m/s, n = {e.late_n}"),
+        ("demonstration's speed", f"{e.demonstration_speed:.3f}", "m/s"),
+        ("excursion", f"{e.excursion:.3f}", f"of the expert's, n = {e.excursion_n}"),
+        ("amplitude MAE", f"{e.amplitude_mae:.2f}", "degrees"),
+        ("Sinkhorn discrepancy", f"{e.sinkhorn:.4f}", ""),
+        ("foot speed in contact", f"{e.contact_foot_speed:.3f}", "m/s"),
+        ("left-right imbalance", f"{e.imbalance:.3f}", ""),
+        ("forward displacement", f"{e.displacement:.2f}", "m"),
+        ("leg ranges (hip, knee, ankle; L, R)", " ".join(f"{r:.0f}" for r in e.joint_ranges), "degrees"),
+        ("expert's leg ranges", " ".join(f"{r:.0f}" for r in e.expert_ranges), "degrees"),
+    ]
+    return "\n".join(f"  {name:<36} {value:>20}  {unit}".rstrip() for name, value, unit in rows)

@@ -1,0 +1,226 @@
+"""What the policy observes and what the prior scores (section IV-A of the paper).
+
+The full forms are 237 numbers for the actor and windows of ten 239-number frames for the prior. Most of a frame's joint
+rotations repeat each other: a hinge about y turns six coordinates of which two are constant and four are its sine and
+cosine, twice each. The program therefore keeps *compact frames* (117 numbers for 29 hinges) and gives the doubled
+coordinates the weight sqrt(2), which leaves every distance between windows what it was.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fmpjax import kinematics, rotations
+from fmpjax.config import FeatureConfig
+from fmpjax.errors import UserError
+from fmpjax.robots import Robot
+
+
+class _Parts(NamedTuple):
+    """The physical quantities that every observation is made of, float32 or float64 as the state."""
+
+    root: jax.Array  # [..., 3] m
+    rotation: jax.Array  # [..., 6]
+    velocity: jax.Array  # [..., 3] m/s, world
+    angular_velocity: jax.Array  # [..., 3] rad/s, world
+    key_points: jax.Array  # [..., 3 K] m, relative to the root
+    joints: jax.Array  # [..., J] rad
+    joint_velocity: jax.Array  # [..., J] rad/s
+
+
+def _parts(robot: Robot, qpos, qvel, poses: kinematics.BodyPoses | None = None) -> _Parts:
+    qpos, qvel = jnp.asarray(qpos), jnp.asarray(qvel)
+    if qpos.shape[-1] != 7 + robot.joint_count or qvel.shape[-1] != 6 + robot.joint_count:
+        raise UserError(
+            f"state of {qpos.shape[-1]} positions and {qvel.shape[-1]} velocities: robot {robot.name} expects "
+            f"{7 + robot.joint_count} and {6 + robot.joint_count}"
+        )
+    poses = kinematics.body_poses(robot, qpos) if poses is None else poses
+    offsets = kinematics.key_points(robot, poses) - qpos[..., None, :3]
+    return _Parts(
+        root=qpos[..., :3],
+        rotation=rotations.to_6d(qpos[..., 3:7]),
+        velocity=qvel[..., :3],
+        # MuJoCo gives the root's angular velocity in the body's axes.
+        angular_velocity=rotations.rotate(qpos[..., 3:7], qvel[..., 3:6]),
+        key_points=offsets.reshape(*offsets.shape[:-2], -1),
+        joints=qpos[..., 7:],
+        joint_velocity=qvel[..., 6:],
+    )
+
+
+def _rotation_terms(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """6D rotation of each hinge as ``cosine * C + sine * S + K``, each ``[J, 6]`` (Rodrigues)."""
+    axis = robot.joint_axis
+    cosine, sine, constant = [], [], []
+    for column in (0, 2):
+        unit = np.eye(3)[column]
+        along = axis * axis[:, [column]]
+        cosine.append(unit - along)
+        sine.append(np.cross(axis, unit))
+        constant.append(along)
+    return tuple(np.concatenate(term, axis=-1) for term in (cosine, sine, constant))
+
+
+def _joint_rotations(robot: Robot, joints: jax.Array) -> jax.Array:
+    """6D rotations in body order with the jointless identity row, ``[..., 6 (J + 1)]``."""
+    cosine, sine, constant = (jnp.asarray(t, joints.dtype) for t in _rotation_terms(robot))
+    angle = joints[..., None]
+    rows = jnp.cos(angle) * cosine + jnp.sin(angle) * sine + constant
+    identity = jnp.broadcast_to(jnp.array([1, 0, 0, 0, 0, 1], rows.dtype), (*rows.shape[:-2], 1, 6))
+    cut = robot.jointless_row
+    rows = jnp.concatenate([rows[..., :cut, :], identity, rows[..., cut:, :]], axis=-2)
+    return rows.reshape(*rows.shape[:-2], -1)
+
+
+def actor_observation(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+    """The policy's observation, ``[..., 237]`` for 29 joints.
+
+    Root height (m), root rotation 6D, root velocity (m/s) and angular velocity (rad/s) in world axes, joint rotations 6D,
+    joint velocities (rad/s), key points less the root (m).
+
+    Args:
+      qpos: ``[..., 7 + J]`` root xyz, quaternion wxyz, joints.
+      qvel: ``[..., 6 + J]`` root velocity in the world, root angular velocity in the body, joint velocities.
+    """
+    p = _parts(robot, qpos, qvel)
+    return jnp.concatenate(
+        [
+            p.root[..., 2:],
+            p.rotation,
+            p.velocity,
+            p.angular_velocity,
+            _joint_rotations(robot, p.joints),
+            p.joint_velocity,
+            p.key_points,
+        ],
+        axis=-1,
+    )
+
+
+def prior_window(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+    """The prior's window before normalisation, ``[..., H * 239]`` for 29 joints, oldest frame first.
+
+    A frame is root position (m; x and y relative to the newest frame, z absolute), root rotation 6D, joint rotations 6D,
+    key points less that frame's root (m), root velocity (m/s), root angular velocity (rad/s), joint velocities (rad/s).
+
+    Args:
+      qpos: ``[..., H, 7 + J]`` states, oldest first.
+      qvel: ``[..., H, 6 + J]``.
+    """
+    p = _parts(robot, qpos, qvel)
+    root = p.root.at[..., :2].add(-p.root[..., -1:, :2])
+    frames = jnp.concatenate(
+        [
+            root,
+            p.rotation,
+            _joint_rotations(robot, p.joints),
+            p.key_points,
+            p.velocity,
+            p.angular_velocity,
+            p.joint_velocity,
+        ],
+        axis=-1,
+    )
+    return frames.reshape(*frames.shape[:-2], -1)
+
+
+class Observed(NamedTuple):
+    """What one forward-kinematics pass of a state gives."""
+
+    actor: jax.Array  # [..., O] the policy's observation
+    frame: jax.Array  # [..., F] compact frame with absolute root position
+    fallen: jax.Array  # [...] bool
+
+
+def observe(robot: Robot, qpos: jax.Array, qvel: jax.Array, observation: str) -> Observed:
+    """The policy's observation, the compact frame and the fall test of states ``qpos``, ``qvel``."""
+    poses = kinematics.body_poses(robot, qpos)
+    p = _parts(robot, qpos, qvel, poses)
+    if observation == "full":
+        joints = [_joint_rotations(robot, p.joints), p.joint_velocity]
+    else:
+        joints = [p.joints, p.joint_velocity]
+    actor = jnp.concatenate(
+        [p.root[..., 2:], p.rotation, p.velocity, p.angular_velocity, *joints, p.key_points], axis=-1
+    )
+    frame = jnp.concatenate(
+        [
+            p.root,
+            p.rotation,
+            jnp.cos(p.joints),
+            jnp.sin(p.joints),
+            p.key_points,
+            p.velocity,
+            p.angular_velocity,
+            p.joint_velocity,
+        ],
+        axis=-1,
+    )
+    return Observed(actor, frame, kinematics.fallen(robot, poses))
+
+
+def frame_size(robot: Robot) -> int:
+    """Numbers in a full frame of the prior, 239 for 29 joints."""
+    return 3 + 6 + 6 * (robot.joint_count + 1) + 3 * len(robot.key_body) + 3 + 3 + robot.joint_count
+
+
+def velocity_index(robot: Robot) -> int:
+    """Where the root's velocity along x (m/s) stands in a compact frame."""
+    return 9 + 2 * robot.joint_count + 3 * len(robot.key_body)
+
+
+def compact_weights(robot: Robot) -> np.ndarray:
+    """How often a compact coordinate stands in the full frame, as a distance weight (square root), ``[F]``."""
+    cosine, sine, _ = _rotation_terms(robot)
+    if not np.isin(np.abs(robot.joint_axis), (0, 1)).all():
+        raise UserError(f"robot {robot.name} has a hinge off its body's axes: compact frames need axes along x, y or z")
+    ones = np.ones
+    return np.concatenate(
+        [
+            ones(9),
+            np.linalg.norm(cosine, axis=-1),
+            np.linalg.norm(sine, axis=-1),
+            ones(3 * len(robot.key_body) + 6 + robot.joint_count),
+        ]
+    )
+
+
+def relative_windows(frames: jax.Array) -> jax.Array:
+    """Windows ``[..., H, F]`` of compact frames with x and y made relative to the newest frame."""
+    return frames.at[..., :2].add(-frames[..., -1:, :2])
+
+
+class FeatureMap(NamedTuple):
+    """The fixed map f from windows to the features that transport compares.
+
+    Standardise with the demonstration's mean and deviation, clip, weigh, divide by sqrt(d), where d counts the full
+    frame's coordinates: distances are those of the full 2,390-dimensional features.
+    """
+
+    mean: jax.Array  # [H, F]
+    deviation: jax.Array  # [H, F]
+    weight: jax.Array  # [F], multiplicity over sqrt(d)
+    clip: jax.Array  # scalar
+    dimension: jax.Array  # scalar, d
+
+    def __call__(self, frames: jax.Array) -> jax.Array:
+        """Features ``[..., H * F]`` of windows of compact frames ``[..., H, F]``, absolute or relative."""
+        z = (relative_windows(frames) - self.mean) / self.deviation
+        x = jnp.clip(z, -self.clip, self.clip) * self.weight
+        return x.reshape(*x.shape[:-2], -1)
+
+
+def fit_feature_map(robot: Robot, windows: jax.Array, config: FeatureConfig) -> FeatureMap:
+    """Feature map from the demonstration's windows of compact frames ``[W, H, F]``."""
+    dimension = config.history * frame_size(robot)
+    relative = np.asarray(relative_windows(windows), np.float64)
+    return FeatureMap(
+        mean=jnp.asarray(relative.mean(0), jnp.float32),
+        deviation=jnp.asarray(np.maximum(relative.std(0), config.deviation_floor), jnp.float32),
+        weight=jnp.asarray(compact_weights(robot) / np.sqrt(dimension), jnp.float32),
+        clip=jnp.float32(config.clip),
+        dimension=jnp.float32(dimension),
+    )

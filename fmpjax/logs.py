@@ -1,0 +1,87 @@
+"""A run's metrics: rows of a CSV file, TensorBoard scalars, and a line for people."""
+
+import csv
+import math
+import os
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from tensorboardX import SummaryWriter
+
+_FIRST = ("iteration", "transitions", "seconds")
+
+
+class MetricsLog:
+    """``metrics.csv`` and ``tensorboard/`` of a run folder; a resumed run goes on where its checkpoint stands."""
+
+    def __init__(self, run: Path, columns: list[str], iteration: int = 0):
+        self._path = run / "metrics.csv"
+        self._columns = [*_FIRST, *columns]
+        rows = self.read(self._path) if iteration else []
+        self.rows = [row for row in rows if int(row["iteration"]) <= iteration]
+        # Rows beyond the checkpoint are computed again, so the file is cut back to it, by way of a new file.
+        partial = self._path.with_suffix(".partial")
+        with partial.open("w", newline="") as file:
+            writer = csv.DictWriter(file, self._columns, extrasaction="ignore", restval="")
+            writer.writeheader()
+            writer.writerows(self.rows)
+        os.replace(partial, self._path)
+        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=iteration or None)
+
+    @property
+    def seconds(self) -> float:
+        """Training time behind the last row, s."""
+        return float(self.rows[-1]["seconds"]) if self.rows else 0.0
+
+    def write(self, iteration: int, transitions: int, seconds: float, values: Mapping[str, float]) -> None:
+        """One row; what is missing or not a number stays empty."""
+        row = {"iteration": iteration, "transitions": transitions, "seconds": f"{seconds:.2f}"}
+        row |= {k: f"{v:.6g}" for k, v in values.items() if not math.isnan(v)}
+        self.rows.append(row)
+        with self._path.open("a", newline="") as file:
+            csv.DictWriter(file, self._columns, extrasaction="ignore", restval="").writerow(row)
+        for name, value in values.items():
+            if not math.isnan(value):
+                self._board.add_scalar(name, value, transitions)
+        self._board.flush()
+
+    def close(self) -> None:
+        self._board.close()
+
+    @staticmethod
+    def read(path: Path) -> list[dict[str, str]]:
+        """Rows of a metrics file; an incomplete last line is left out."""
+        if not path.exists():
+            return []
+        with path.open(newline="") as file:
+            return [row for row in csv.DictReader(file) if None not in row.values()]
+
+
+class Progress:
+    """One line that follows a run: rewritten on a terminal, printed now and then into a file."""
+
+    def __init__(self, interval: float = 15.0):
+        self._terminal = sys.stdout.isatty()
+        self._interval, self._last = interval, -math.inf
+
+    def note(self, text: str) -> None:
+        """A line that stays."""
+        print(("\r\033[K" if self._terminal else "") + text, flush=True)
+
+    def show(self, text: str, *, final: bool = False) -> None:
+        """The progress line."""
+        now = time.monotonic()
+        if self._terminal:
+            print("\r\033[K" + text, end="\n" if final else "", flush=True)
+        elif final or now - self._last >= self._interval:
+            print(text, flush=True)
+            self._last = now
+
+
+def clock(seconds: float) -> str:
+    """``h:mm:ss`` or ``m:ss``."""
+    minutes, s = divmod(int(max(seconds, 0)), 60)
+    hours, m = divmod(minutes, 60)
+    return f"{hours}:{m:02d}:{s:02d}" if hours else f"{m}:{s:02d}"

@@ -1,0 +1,228 @@
+"""Gait metrics of an evaluation (paper, section "Evaluation protocol and metrics").
+
+Everything is a pure function on NumPy arrays, computed in float64. ``T`` recorded steps, ``N`` environments; the state
+after step ``k`` stands in row ``k``, at time ``(k + 1) / rate``. ``length [N]``, 1 to T, counts the rows of the first
+episode; later rows are never read. The metrics return one value per episode, NaN where an episode does not contribute;
+`summarise` makes the number to report and how many episodes stand behind it.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from fmpjax.errors import UserError
+
+RATE = 50.0  # Hz, control steps
+LATE_START, LATE_END = 5.0, 10.0  # s, both included
+WINDOW = 1.0  # s, of a joint range
+PERCENTILES = 5.0, 95.0
+STILL = 1e-6  # rad; a joint whose expert range is smaller has no ratio to it
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """A metric over episodes: the mean of those that contribute and their number; NaN and 0 when none does."""
+
+    mean: float
+    n: int
+
+
+def summarise(per_episode: np.ndarray) -> Summary:
+    """Mean and number of the finite values of ``per_episode [N]``."""
+    finite = np.isfinite(per_episode)
+    return Summary(float(_mean(np.asarray(per_episode, np.float64), axis=0)), int(finite.sum()))
+
+
+def late_speed(
+    root_position: np.ndarray,
+    length: np.ndarray,
+    heading: np.ndarray,
+    *,
+    rate: float = RATE,
+    start: float = LATE_START,
+    end: float = LATE_END,
+) -> np.ndarray:
+    """Signed forward speed over the valid steps between 5 and 10 s, m/s.
+
+    The mean speed between the first and the last valid step of that time. An episode with fewer than two valid steps in
+    it is excluded and not counted as speed zero.
+
+    Args:
+      root_position: ``[T, N, 3]`` m.
+      length: ``[N]`` valid steps.
+      heading: ``[N]`` rad, of the demonstration at reset.
+      rate: Hz.
+      start: s.
+      end: s, included.
+
+    Returns:
+      ``[N]``, NaN where excluded.
+    """
+    root_position = np.asarray(root_position, np.float64)
+    # Half a step of slack: row k is at (k + 1) / rate, whatever that rounds to.
+    first = int(np.ceil(start * rate - 0.5)) - 1
+    last = np.minimum(np.asarray(length), int(np.floor(end * rate + 0.5))) - 1
+    included = last > first
+    last = np.where(included, last, 0)
+    moved = _rows(root_position, last) - root_position[min(first, len(root_position) - 1)]
+    seconds = np.where(included, last - first, 1) / rate
+    return np.where(included, _forward(moved, heading) / seconds, np.nan)
+
+
+def forward_displacement(
+    root_position: np.ndarray, length: np.ndarray, heading: np.ndarray, start_position: np.ndarray | None = None
+) -> np.ndarray:
+    """Signed distance along the demonstration's heading, from the reset to the last valid step, m.
+
+    Args:
+      root_position: ``[T, N, 3]`` m.
+      length: ``[N]`` valid steps.
+      heading: ``[N]`` rad, of the demonstration at reset.
+      start_position: ``[N, 3]`` m, at reset; the first recorded step, one control step later, where it is not given.
+
+    Returns:
+      ``[N]``.
+    """
+    root_position = np.asarray(root_position, np.float64)
+    start = root_position[0] if start_position is None else np.asarray(start_position, np.float64)
+    return _forward(_rows(root_position, np.asarray(length) - 1) - start, heading)
+
+
+def window_ranges(
+    joint_position: np.ndarray,
+    length: np.ndarray,
+    joints: np.ndarray,
+    *,
+    rate: float = RATE,
+    window: float = WINDOW,
+) -> np.ndarray:
+    """Range of each joint in each complete window of one second: 95th minus 5th percentile, rad.
+
+    Windows follow one another from the first step on, and do not overlap; percentiles interpolate linearly.
+
+    Args:
+      joint_position: ``[T, N, J]`` rad.
+      length: ``[N]`` valid steps.
+      joints: ``[6]`` indices into J, the robot's sagittal leg joints, left then right.
+      rate: Hz.
+      window: s.
+
+    Returns:
+      ``[W, N, 6]``, NaN where the window is not complete.
+    """
+    size = round(window * rate)
+    q = np.asarray(joint_position, np.float64)[..., joints]
+    count = len(q) // size
+    low, high = np.percentile(q[: count * size].reshape(count, size, *q.shape[1:]), PERCENTILES, axis=1)
+    complete = (np.arange(count)[:, None] + 1) * size <= np.asarray(length)
+    return np.where(complete[..., None], high - low, np.nan)
+
+
+def expert_ranges(
+    joint_position: np.ndarray, joints: np.ndarray, *, rate: float = RATE, window: float = WINDOW
+) -> np.ndarray:
+    """Range of each joint in the demonstration, rad: the mean over its complete windows of one second, ``[6]``.
+
+    Args:
+      joint_position: ``[T, J]`` rad, the clip at ``rate``.
+      joints: ``[6]`` indices into J.
+      rate: Hz.
+      window: s.
+
+    Raises:
+      UserError: the clip is shorter than one window.
+    """
+    frames = len(joint_position)
+    ranges = window_ranges(np.asarray(joint_position)[:, None], np.array([frames]), joints, rate=rate, window=window)
+    if not len(ranges):
+        raise UserError(f"demonstration of {frames} frames at {rate:g} Hz: expected at least {window:g} s of motion")
+    return ranges[:, 0].mean(axis=0)
+
+
+def excursion(ranges: np.ndarray, expert: np.ndarray) -> np.ndarray:
+    """Ratio of the policy's joint ranges to the expert's, mean over joints and complete windows but the first.
+
+    A joint that the expert holds still has no ratio and is left out.
+
+    Args:
+      ranges: ``[W, N, 6]`` rad, of `window_ranges`.
+      expert: ``[6]`` rad, of `expert_ranges`.
+
+    Returns:
+      ``[N]``, NaN for an episode without a complete second window.
+    """
+    moving = expert > STILL
+    return _mean(ranges[1:, :, moving] / expert[moving], axis=(0, 2))
+
+
+def amplitude_mae(ranges: np.ndarray, expert: np.ndarray) -> np.ndarray:
+    """Mean absolute difference of the policy's and the expert's joint ranges, degrees, over all complete windows.
+
+    Args:
+      ranges: ``[W, N, 6]`` rad, of `window_ranges`.
+      expert: ``[6]`` rad, of `expert_ranges`.
+
+    Returns:
+      ``[N]``, NaN for an episode without a complete window.
+    """
+    return np.rad2deg(_mean(np.abs(ranges - expert), axis=(0, 2)))
+
+
+def left_right_imbalance(ranges: np.ndarray) -> np.ndarray:
+    """How far left and right joint ranges differ: ``|left - right| / mean(left, right)``, mean over joint pairs.
+
+    Ranges are first averaged over the episode's complete windows: a window of one second need not hold a whole stride,
+    and what it cuts off is not an imbalance of the gait. 0 is symmetric (or neither side moves), 2 is one-sided.
+
+    Args:
+      ranges: ``[W, N, 6]`` rad, of `window_ranges`: three joints of the left leg, then the same of the right.
+
+    Returns:
+      ``[N]``, NaN for an episode without a complete window.
+    """
+    left, right = np.split(_mean(ranges, axis=0), 2, axis=-1)
+    total = left + right
+    # NaN stays NaN; only 0/0, two legs at rest, is replaced.
+    return _mean(2.0 * np.abs(left - right) / np.where(total == 0.0, 1.0, total), axis=-1)
+
+
+def contact_foot_speed(
+    foot_position: np.ndarray, contact: np.ndarray, length: np.ndarray, *, rate: float = RATE
+) -> np.ndarray:
+    """Mean planar speed of a foot while it is in contact with the floor, m/s.
+
+    Speed is taken between successive steps, and counts where the foot is in contact at both.
+
+    Args:
+      foot_position: ``[T, N, F, 3]`` m.
+      contact: ``[T, N, F]`` bool.
+      length: ``[N]`` valid steps.
+      rate: Hz.
+
+    Returns:
+      ``[N]``, NaN for an episode without such a pair of steps.
+    """
+    planar = np.asarray(foot_position, np.float64)[..., :2]
+    contact = np.asarray(contact, bool)
+    with np.errstate(invalid="ignore"):  # rows after the episode may hold anything
+        speed = np.linalg.norm(np.diff(planar, axis=0), axis=-1) * rate
+    valid = np.arange(1, len(planar))[:, None, None] < np.asarray(length)[:, None]
+    return _mean(np.where(contact[1:] & contact[:-1] & valid, speed, np.nan), axis=(0, 2))
+
+
+def _rows(x: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """``x[row[n], n]`` for each environment of ``x [T, N, ...]``."""
+    return x[row, np.arange(x.shape[1])]
+
+
+def _forward(moved: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    """Component of ``moved [N, 3]`` along ``heading [N]``, NaN where the episode ends in a state that is not finite."""
+    moved = np.where(np.isfinite(moved), moved, np.nan)
+    return moved[:, 0] * np.cos(heading) + moved[:, 1] * np.sin(heading)
+
+
+def _mean(x: np.ndarray, axis: int | tuple[int, ...]) -> np.ndarray:
+    """Mean of the finite values along ``axis``, NaN where there are none; unlike `np.nanmean` it does not warn."""
+    finite = np.isfinite(x)
+    count = finite.sum(axis=axis)
+    return np.where(count > 0, np.where(finite, x, 0.0).sum(axis=axis) / np.maximum(count, 1), np.nan)

@@ -1,0 +1,29 @@
+"""What a physics backend offers: one control step for a batch of robots on a floor."""
+
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+
+
+class PhysicsState(NamedTuple):
+    """Physical state of N robots; all that a backend needs to go on."""
+
+    qpos: jax.Array  # [N, 7 + J] root xyz m, root quaternion wxyz, joints rad
+    qvel: jax.Array  # [N, 6 + J] root velocity (world) m/s, angular velocity (body) rad/s, joints rad/s
+    warmstart: jax.Array  # [N, 6 + J] accelerations from which the constraint solver starts
+
+
+class Physics(Protocol):
+    """A backend. Both entries are pure and jittable."""
+
+    name: str
+
+    def step(self, state: PhysicsState, targets: jax.Array) -> PhysicsState:
+        """Advance one control step with joint targets ``[N, J]`` (rad) held by the servos."""
+        ...
+
+
+def reset(qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
+    """State at rest in the solver from positions and velocities."""
+    return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))

@@ -1,0 +1,42 @@
+"""The interface of every motion prior: a pair of pure functions, as in optax."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+PriorState = Any
+Metrics = Mapping[str, jax.Array]
+
+
+class Rollout(NamedTuple):
+    """What a prior sees of a rollout of T steps in N environments."""
+
+    features: jax.Array  # [T, N, D] features of the windows that end with the post-step, pre-reset states
+    valid: jax.Array  # [T, N] bool, false where the state was not finite
+
+
+class MotionPrior(NamedTuple):
+    """A learned reward.
+
+    ``update`` owns its order: transport priors fit and then score, a discriminator scores and then fits.
+    """
+
+    init: Callable[[jax.Array], PriorState]
+    update: Callable[[PriorState, Rollout, jax.Array], tuple[PriorState, jax.Array, Metrics]]
+
+
+class Reward(NamedTuple):
+    """A reward and the statistics that normalised it."""
+
+    reward: jax.Array  # [T, N]
+    median: jax.Array
+    spread: jax.Array  # interquartile range
+
+
+def median_reward(score: jax.Array, valid: jax.Array, spread_floor: float) -> Reward:
+    """r = 2 sigmoid((S - median) / max(IQR, floor)) over the rollout's valid windows (eq. reward), 0 elsewhere."""
+    low, middle, high = jnp.nanquantile(jnp.where(valid, score, jnp.nan), jnp.array([0.25, 0.5, 0.75]))
+    reward = 2.0 * jax.nn.sigmoid((score - middle) / jnp.maximum(high - low, spread_floor))
+    return Reward(jnp.where(valid & jnp.isfinite(reward), reward, 0.0), middle, high - low)

@@ -1,0 +1,197 @@
+"""Flow-Matched Motion Prior: the transport potential fitted online (sections III-C and III-D of the paper).
+
+Every update draws a source bank from the rollout, solves its transport to the expert bank and to itself, and takes one
+Adam step on three losses: the centred value of the score, its gradient, and the flow along rollout-to-expert paths. The
+average of the rollout's parameters then scores every window.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from fmpjax import potential, transport
+from fmpjax.config import PriorConfig
+from fmpjax.priors.base import MotionPrior, Rollout, median_reward
+
+
+class FlowState(NamedTuple):
+    """State of the prior between rollouts."""
+
+    params: potential.Params
+    optimizer: optax.OptState
+    average: potential.Params  # averaged over the last rollout's updates; it scores
+
+
+class Teacher(NamedTuple):
+    """Transport supervision at the queries of one update."""
+
+    score: jax.Array  # [q] up to a constant
+    gradient: jax.Array  # [q, D]
+    to_expert: jax.Array  # [q, m] conditional matching probabilities
+    to_source: jax.Array  # [q, n]
+    solution: transport.Solve
+
+
+def teach(
+    source: jax.Array, expert: jax.Array, query: jax.Array | None, dimension: jax.Array, config: PriorConfig
+) -> Teacher:
+    """Solve one source bank and read score, gradient and matching probabilities at the queries.
+
+    Args:
+      source: ``[n, D]``; also the queries when ``query`` is None, which saves two cost matrices.
+      expert: ``[m, D]``.
+      query: ``[q, D]`` or None.
+    """
+    cross, itself = transport.squared_cost(source, expert), transport.squared_cost(source, source)
+    solution = transport.solve(
+        cross,
+        itself,
+        transport.entropy_coefficient(cross, dimension, config.epsilon_fraction),
+        threshold=config.sinkhorn_threshold,
+        max_iterations=config.sinkhorn_iterations,
+    )
+    if query is None:
+        query_to_expert, query_to_source = cross, itself
+    else:
+        query_to_expert = transport.squared_cost(query, expert)
+        query_to_source = transport.squared_cost(query, source)
+    expert_value, to_expert = transport.extension(query_to_expert, solution.expert_dual, solution.epsilon)
+    source_value, to_source = transport.extension(query_to_source, solution.self_dual, solution.epsilon)
+    return Teacher(
+        score=expert_value - source_value,
+        # The -x of the two gradients cancels.
+        gradient=to_expert @ expert - to_source @ source,
+        to_expert=to_expert,
+        to_source=to_source,
+        solution=solution,
+    )
+
+
+class Flow(NamedTuple):
+    """Flow-matching samples of one update."""
+
+    point: jax.Array  # [q, D] x_tau
+    tau: jax.Array  # [q]
+    head: jax.Array  # [q, 3] one-hot
+    velocity: jax.Array  # [q, D] z - x
+
+
+def sample_flow(key, query, teacher: Teacher, source, expert) -> Flow:
+    """Draw a head, a target atom by that head's probabilities, and a flow time for each query (eq. flow)."""
+    head_key, atom_key, tau_key = jax.random.split(key, 3)
+    head = jax.random.randint(head_key, query.shape[:1], 0, potential.HEADS)
+    draw = jax.random.uniform(atom_key, query.shape[:1])
+
+    def atoms(probability, targets):
+        index = (jnp.cumsum(probability, axis=-1) < draw[:, None]).sum(-1)
+        return targets[jnp.minimum(index, len(targets) - 1)]
+
+    target = jnp.where((head == 0)[:, None], atoms(teacher.to_expert, expert), atoms(teacher.to_source, source))
+    tau = jax.random.uniform(tau_key, query.shape[:1])
+    velocity = target - query
+    return Flow(query + tau[:, None] * velocity, tau, jax.nn.one_hot(head, potential.HEADS), velocity)
+
+
+def losses(params, query, teacher: Teacher, flow: Flow, dimension, config: PriorConfig):
+    """Weighted sum of the losses and each of them (eqs. value, endpoint, flow).
+
+    Queries at time zero and flow points go through the network as one batch.
+    """
+    count = len(query)
+    contrast = jnp.broadcast_to(jnp.asarray(potential.SCORE_CONTRAST), (count, potential.HEADS))
+    terms = {}
+    if config.flow_weight:
+        points = jnp.concatenate([query, flow.point])
+        times = jnp.concatenate([jnp.zeros(count), flow.tau])
+        weights = jnp.concatenate([contrast, flow.head])
+        values, gradients = potential.contrast(params, points, times, weights, dimension)
+        terms["flow"] = jnp.mean(jnp.sum((gradients[count:] - flow.velocity) ** 2, axis=-1))
+        values, gradients = values[:count], gradients[:count]
+    else:
+        values, gradients = potential.contrast(params, query, jnp.zeros(count), contrast, dimension)
+    if config.endpoint_weight:
+        terms["endpoint"] = jnp.mean(jnp.sum((gradients - teacher.gradient) ** 2, axis=-1))
+    error = (values - values.mean()) - (teacher.score - teacher.score.mean())
+    terms["value"] = jnp.mean(error**2) / config.value_scale**2
+    total = sum(getattr(config, f"{name}_weight") * term for name, term in terms.items())
+    return total, terms
+
+
+def make(expert_bank: jax.Array, dimension: float, config: PriorConfig) -> MotionPrior:
+    """The prior for an expert bank ``[m, D]`` of features that stand for ``dimension`` coordinates."""
+    optimizer = optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.adam(config.learning_rate))
+    # Weight of the newest parameters such that an update's share halves after `average_half_life` updates.
+    newest = 1.0 - 0.5 ** (1.0 / config.average_half_life)
+
+    def init(key):
+        params = potential.init(key, expert_bank.shape[-1], dimension, config.hidden)
+        return FlowState(params, optimizer.init(params), params)
+
+    def fit_once(carry, key, pool, query_pool):
+        params, optimizer_state, average = carry
+        bank_key, query_key, flow_key = jax.random.split(key, 3)
+        source = pool[jax.random.randint(bank_key, (config.bank,), 0, len(pool))]
+        if config.query_is_bank:
+            query, teacher = source, teach(source, expert_bank, None, dimension, config)
+        else:
+            query = query_pool[jax.random.randint(query_key, (config.minibatch,), 0, len(query_pool))]
+            teacher = teach(source, expert_bank, query, dimension, config)
+        flow = sample_flow(flow_key, query, teacher, source, expert_bank)
+        (total, terms), gradients = jax.value_and_grad(losses, has_aux=True)(
+            params, query, teacher, flow, dimension, config
+        )
+        norm = optax.global_norm(gradients)
+        updates, new_optimizer_state = optimizer.update(gradients, optimizer_state)
+        finite = jnp.isfinite(total) & jnp.isfinite(norm)
+        keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)  # noqa: E731
+        params = keep(optax.apply_updates(params, updates), params)
+        optimizer_state = keep(new_optimizer_state, optimizer_state)
+        average = jax.tree.map(lambda a, p: a + newest * (p - a), average, params)
+        metrics = {f"{name}_loss": term for name, term in terms.items()} | {
+            "gradient_norm": norm,
+            "epsilon": teacher.solution.epsilon,
+            "sinkhorn_iterations": teacher.solution.iterations.max(),
+            "unconverged": (~teacher.solution.converged).sum().astype(jnp.float32),
+            "skipped": (~finite).astype(jnp.float32),
+            "value_correlation": _correlation(
+                potential.score(params, query, dimension), teacher.score
+            ),
+        }
+        return (params, optimizer_state, average), metrics
+
+    def update(state: FlowState, rollout: Rollout, key):
+        steps, count, size = rollout.features.shape
+        # A window that is not finite is replaced by the first expert window: it neither spreads nor is rewarded.
+        features = jnp.where(rollout.valid[..., None], rollout.features, expert_bank[0])
+        pool = features.reshape(-1, size)
+        query_count = max(1, int(config.query_share * count))
+        query_pool = pool if query_count == count else features[:, :query_count].reshape(-1, size)
+        carry, metrics = jax.lax.scan(
+            lambda carry, key: fit_once(carry, key, pool, query_pool),
+            (state.params, state.optimizer, state.params),
+            jax.random.split(key, config.updates),
+        )
+        state = FlowState(*carry)
+        scores = potential.score(state.average, pool, dimension).reshape(steps, count)
+        result = median_reward(scores, rollout.valid, config.spread_floor)
+        summary = {name: values.mean() for name, values in metrics.items()}
+        for name in ("unconverged", "skipped"):
+            summary[name] = metrics[name].sum()
+        expert_scores = potential.score(state.average, expert_bank, dimension)
+        summary |= {
+            "score_median": result.median,
+            "score_spread": result.spread,
+            # Where the demonstration stands in the reward's own units.
+            "expert_margin": (jnp.mean(expert_scores) - result.median)
+            / jnp.maximum(result.spread, config.spread_floor),
+        }
+        return state, result.reward, summary
+
+    return MotionPrior(init, update)
+
+
+def _correlation(a, b):
+    a, b = a - a.mean(), b - b.mean()
+    return jnp.sum(a * b) / jnp.sqrt(jnp.maximum(jnp.sum(a * a) * jnp.sum(b * b), 1e-30))

@@ -1,0 +1,147 @@
+"""The robot: its MuJoCo model and the facts about it that the rest of the program reads.
+
+A robot is a folder with ``robot.xml`` (MJCF: bodies, joints, servos, collision geoms) and ``robot.toml`` (key points,
+default pose, joints that the gait metrics read). Nothing else in the package names a joint or a body.
+"""
+
+import dataclasses
+import functools
+import tomllib
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from fmpjax import resources
+from fmpjax.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Robot:
+    """A floating-base robot with hinge joints, on a floor.
+
+    Arrays are float64 on the host; joints are in model order. ``J`` joints, ``B`` bodies without the world, ``K`` key
+    points, ``C`` fall spheres and capsules, ``P`` sole points.
+    """
+
+    name: str
+    model: mujoco.MjModel
+    joint_names: tuple[str, ...]
+    joint_axis: np.ndarray  # [J, 3] unit axis in the joint's body
+    joint_low: np.ndarray  # [J] rad
+    joint_high: np.ndarray  # [J] rad
+    effort: np.ndarray  # [J] motor limit, N m
+    stiffness: np.ndarray  # [J] servo kp, N m/rad
+    damping: np.ndarray  # [J] servo kd, N m s/rad
+    default_qpos: np.ndarray  # [7 + J] default pose with the soles on the floor
+    body_parent: np.ndarray  # [B] index of the parent body, -1 for the root
+    body_position: np.ndarray  # [B, 3] m, in the parent
+    body_rotation_wxyz: np.ndarray  # [B, 4], in the parent
+    body_joint: np.ndarray  # [B] index of the body's hinge, -1 without
+    jointless_row: int  # row of the joint-rotation block that is always the identity
+    key_point_names: tuple[str, ...]
+    key_body: np.ndarray  # [K]
+    key_offset: np.ndarray  # [K, 3] m, in the body
+    fall_body: np.ndarray  # [C]
+    fall_ends: np.ndarray  # [C, 2, 3] m, capsule axis ends in the body; equal for a sphere
+    fall_radius: np.ndarray  # [C] m
+    sole_body: np.ndarray  # [P]
+    sole_point: np.ndarray  # [P, 3] m, centre of the sphere in the body
+    sole_radius: np.ndarray  # [P] m
+    sagittal_joints: np.ndarray  # [6] indices: left hip, knee, ankle, then right
+    total_mass: float  # kg
+
+    @property
+    def joint_count(self) -> int:
+        return len(self.joint_names)
+
+    def physics_model(self, **options) -> mujoco.MjModel:
+        """A copy of the model with other solver options, e.g. ``timestep=0.01``; ``frictionloss`` is per joint, N m."""
+        model = mujoco.MjModel.from_xml_path(str(resources.folder("robots") / self.name / "robot.xml"))
+        if "frictionloss" in options:
+            model.dof_frictionloss[6:] = options.pop("frictionloss")
+        for key, value in options.items():
+            setattr(model.opt, key, value)
+        return model
+
+
+def available() -> list[str]:
+    """Names that `load` accepts."""
+    return sorted(p.parent.name for p in resources.folder("robots").glob("*/robot.xml"))
+
+
+@functools.cache
+def load(name: str) -> Robot:
+    """Load a shipped robot by its folder's name.
+
+    Raises:
+      UserError: the name is unknown.
+    """
+    path = resources.folder("robots") / name / "robot.xml"
+    if name not in available():
+        raise UserError(f"unknown robot {name!r}: expected one of {', '.join(available())}")
+    return _read(name, path)
+
+
+def _read(name: str, path: Path) -> Robot:
+    model = mujoco.MjModel.from_xml_path(str(path))
+    facts = tomllib.loads(path.with_suffix(".toml").read_text())
+    joint_names = tuple(model.joint(i).name for i in range(1, model.njnt))
+    index = {joint: i for i, joint in enumerate(joint_names)}
+    body_joint = np.full(model.nbody - 1, -1)
+    body_joint[model.jnt_bodyid[1:] - 1] = np.arange(len(joint_names))
+    geoms = [model.geom(i) for i in range(model.ngeom)]
+    fall = [g for g in geoms if g.name.endswith("_fall")]
+    soles = [g for g in geoms if "_foot_" in g.name]
+    default = model.qpos0.copy()
+    for joint, angle in facts["default_pose"].items():
+        default[7 + index[joint]] = angle
+    robot = Robot(
+        name=name,
+        model=model,
+        joint_names=joint_names,
+        joint_axis=model.jnt_axis[1:].copy(),
+        joint_low=model.jnt_range[1:, 0].copy(),
+        joint_high=model.jnt_range[1:, 1].copy(),
+        effort=model.actuator_forcerange[:, 1].copy(),
+        stiffness=model.actuator_gainprm[:, 0].copy(),
+        damping=-model.actuator_biasprm[:, 2],
+        default_qpos=default,
+        body_parent=model.body_parentid[1:] - 1,
+        body_position=np.where(np.arange(model.nbody - 1)[:, None] == 0, 0.0, model.body_pos[1:]),
+        body_rotation_wxyz=model.body_quat[1:].copy(),
+        body_joint=body_joint,
+        jointless_row=index[facts["jointless_row_after"]] + 1,
+        key_point_names=tuple(p["name"] for p in facts["key_points"]),
+        key_body=np.array([model.body(p["body"]).id - 1 for p in facts["key_points"]]),
+        key_offset=np.array([p.get("offset", (0.0, 0.0, 0.0)) for p in facts["key_points"]]),
+        fall_body=np.array([g.bodyid[0] - 1 for g in fall]),
+        fall_ends=np.array([_axis_ends(g) for g in fall]),
+        fall_radius=np.array([g.size[0] for g in fall]),
+        sole_body=np.array([g.bodyid[0] - 1 for g in soles]),
+        sole_point=np.array([g.pos for g in soles]),
+        sole_radius=np.array([g.size[0] for g in soles]),
+        sagittal_joints=np.array([index[j] for j in facts["sagittal_joints"]]),
+        total_mass=float(model.body_mass.sum()),
+    )
+    robot.default_qpos[2] -= lowest_sole(robot, robot.default_qpos)
+    return robot
+
+
+def _axis_ends(geom) -> np.ndarray:
+    if geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return np.array([geom.pos, geom.pos])
+    axis = np.zeros(9)
+    mujoco.mju_quat2Mat(axis, geom.quat)
+    half = geom.size[1] * axis.reshape(3, 3)[:, 2]
+    return np.array([geom.pos - half, geom.pos + half])
+
+
+def lowest_sole(robot: Robot, qpos: np.ndarray) -> float:
+    """Height of the lowest sole point above the floor, m, for one configuration ``qpos [7 + J]``."""
+    data = mujoco.MjData(robot.model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(robot.model, data)
+    rotation = data.xmat[robot.sole_body + 1].reshape(-1, 3, 3)
+    points = data.xpos[robot.sole_body + 1] + np.einsum("pij,pj->pi", rotation, robot.sole_point)
+    return float((points[:, 2] - robot.sole_radius).min())

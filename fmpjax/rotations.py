@@ -1,0 +1,88 @@
+"""Quaternion and 6D rotation algebra on NumPy or JAX arrays.
+
+Quaternions are unit, scalar first (``_wxyz``), components on the last axis. Every function takes leading axes freely and
+computes with the array library of its first argument, so the same code serves clips on the host and states on the device.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def _library(x):
+    return jnp if isinstance(x, jax.Array) else np
+
+
+def multiply(a_wxyz, b_wxyz):
+    """Hamilton product of two quaternions, ``[..., 4]``."""
+    xp = _library(a_wxyz)
+    aw, ax, ay, az = (a_wxyz[..., i] for i in range(4))
+    bw, bx, by, bz = (b_wxyz[..., i] for i in range(4))
+    return xp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def conjugate(q_wxyz):
+    """Inverse of a unit quaternion, ``[..., 4]``."""
+    return q_wxyz * np.array([1, -1, -1, -1], q_wxyz.dtype)
+
+
+def rotate(q_wxyz, v):
+    """Rotate vectors ``v [..., 3]`` by ``q_wxyz [..., 4]``."""
+    xp = _library(q_wxyz)
+    w, u = q_wxyz[..., :1], q_wxyz[..., 1:]
+    t = 2.0 * xp.cross(u, v)
+    return v + w * t + xp.cross(u, t)
+
+
+def exp_map(v):
+    """Quaternion ``[..., 4]`` of the rotation vector ``v [..., 3]`` (axis times angle, rad)."""
+    xp = _library(v)
+    half = 0.5 * xp.linalg.norm(v, axis=-1, keepdims=True)
+    return xp.concatenate([xp.cos(half), 0.5 * v * xp.sinc(half / np.pi)], axis=-1)
+
+
+def log_map(q_wxyz):
+    """Rotation vector ``[..., 3]`` (rad) of the shorter rotation that ``q_wxyz`` stands for."""
+    xp = _library(q_wxyz)
+    q = xp.where(q_wxyz[..., :1] < 0, -q_wxyz, q_wxyz)
+    norm = xp.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * xp.arctan2(norm, q[..., :1])
+    # Near zero the angle is twice the vector part; the guard keeps 0/0 out.
+    return q[..., 1:] * xp.where(norm > 1e-12, angle / xp.where(norm > 1e-12, norm, 1.0), 2.0)
+
+
+def slerp(a_wxyz, b_wxyz, fraction):
+    """Shortest-arc interpolation from ``a_wxyz`` to ``b_wxyz``; ``fraction`` in [0, 1] broadcasts against ``[..., 1]``."""
+    return multiply(a_wxyz, exp_map(fraction * log_map(multiply(conjugate(a_wxyz), b_wxyz))))
+
+
+def to_6d(q_wxyz):
+    """First and last column of the rotation matrix, ``[R e_x, R e_z]``, ``[..., 6]``."""
+    xp = _library(q_wxyz)
+    w, x, y, z = (q_wxyz[..., i] for i in range(4))
+    return xp.stack(
+        [
+            1 - 2 * (y * y + z * z),
+            2 * (x * y + w * z),
+            2 * (x * z - w * y),
+            2 * (x * z + w * y),
+            2 * (y * z - w * x),
+            1 - 2 * (x * x + y * y),
+        ],
+        axis=-1,
+    )
+
+
+def yaw(q_wxyz):
+    """Heading of the rotated x axis about z, rad, ``[...]``."""
+    xp = _library(q_wxyz)
+    w, x, y, z = (q_wxyz[..., i] for i in range(4))
+    return xp.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))

@@ -1,0 +1,298 @@
+"""A run on disk: its folder, its training from start or checkpoint to a clean end, and what it leaves to look at."""
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+import platform
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from fmpjax import config as configuration
+from fmpjax import motion
+from fmpjax.checkpoint import Checkpoints
+from fmpjax.config import Config
+from fmpjax.errors import UserError
+from fmpjax.evaluate import Evaluation, Evaluator, table
+from fmpjax.logs import MetricsLog, Progress, clock
+from fmpjax.train import Trainer, TrainState
+from fmpjax.viz import curves, render
+
+_PACKAGES = "jax jaxlib mujoco mujoco-mjx brax flax optax ott-jax orbax-checkpoint numpy".split()
+
+
+def load_motion(config: Config) -> motion.MotionClip:
+    """The demonstration that a configuration names, at its control rate."""
+    return motion.load(
+        config.motion, frames=config.frames or None, rate=round(config.control_rate, 6), robot=config.robot
+    )
+
+
+class Run:
+    """A run folder.
+
+    ``config.json`` and ``provenance.json`` say what it is; ``demonstration.npz`` holds the clip as it was resampled;
+    ``metrics.csv`` and ``tensorboard/`` its course; ``checkpoints/`` and ``best/`` its state.
+    """
+
+    def __init__(self, folder: str | Path):
+        self.folder = Path(folder)
+        self.checkpoints = Checkpoints(self.folder)
+
+    @classmethod
+    def create(cls, folder: str | Path, config: Config) -> "Run":
+        """A new run folder.
+
+        Raises:
+          UserError: the folder holds a run already, or cannot be written.
+        """
+        run = cls(folder)
+        clip = load_motion(config)
+        if (run.folder / "config.json").exists():
+            raise UserError(f"run folder {run.folder} holds a run already: go on with --resume, or name another --run")
+        try:
+            run.folder.mkdir(parents=True, exist_ok=True)
+            motion.save(clip, run.folder / "demonstration.npz")
+            _write(run.folder / "provenance.json", json.dumps(provenance(), indent=1))
+            # Last: a folder with a configuration is a run.
+            _write(run.folder / "config.json", configuration.to_json(config))
+        except OSError as error:
+            raise UserError(f"run folder {run.folder} cannot be written: {error.strerror}") from None
+        return run
+
+    @classmethod
+    def open(cls, folder: str | Path) -> "Run":
+        """An existing run folder.
+
+        Raises:
+          UserError: it is none.
+        """
+        run = cls(folder)
+        if not (run.folder / "config.json").is_file():
+            raise UserError(f"{run.folder} is not a run folder: expected config.json in it")
+        return run
+
+    @property
+    def config(self) -> Config:
+        path = self.folder / "config.json"
+        try:
+            return configuration.from_json(path.read_text())
+        except json.JSONDecodeError:
+            raise UserError(f"{path} is not valid JSON: expected a run's configuration") from None
+
+    def trainer(self) -> Trainer:
+        """The run's parts."""
+        config = self.config
+        clip = motion.load(
+            self.folder / "demonstration.npz", rate=round(config.control_rate, 6), robot=config.robot
+        )
+        return Trainer(config, clip)
+
+    def policy(self, *, best: bool = True) -> tuple[Trainer, TrainState]:
+        """The run's parts and its best state, or its newest where no evaluation chose a best one."""
+        trainer = self.trainer()
+        best = best and self.checkpoints.latest(best=True) is not None
+        return trainer, self.checkpoints.restore(trainer.init(), best=best)
+
+    def save_evaluation(self, evaluation: Evaluation, name: str = "evaluation") -> None:
+        _write(self.folder / f"{name}.json", evaluation.to_json())
+
+
+def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> bool:
+    """Train a run to the end of its budget, or of its time, or until it is told to stop; all three end cleanly.
+
+    Returns:
+      Whether the budget is spent.
+    """
+    config, progress = run.config, Progress()
+    began = time.monotonic()
+    progress.note(f"run {run.folder}: {config.method}, {config.preset}, {config.env.reset} reset, motion {config.motion}")
+    trainer = run.trainer()
+    state = trainer.init()
+    if resume and run.checkpoints.latest() is not None:
+        state = run.checkpoints.restore(state)
+    evaluator = Evaluator(trainer)
+    done = int(state.iteration)
+    if done >= config.iterations:
+        progress.note(f"the budget of {config.transitions:,} transitions is spent already")
+        return True
+    progress.note(
+        f"{trainer.env.physics.name} physics on {_device_name()}; compiling, which takes a minute or so ..."
+    )
+    compile_began = time.monotonic()
+    chunk = trainer.compile(state)
+    progress.note(f"compiled in {time.monotonic() - compile_began:.0f} s; {config.iterations * config.transitions_per_iteration:,} transitions to go to")
+    names = [f"eval/{name}" for name in _evaluation_names()]
+    metric_names = sorted(jax.eval_shape(trainer.iteration, state)[1])
+    log = MetricsLog(run.folder, [*metric_names, *names], done)
+    milestones = _milestones(config)
+    best = _best_quality(log)
+    training_seconds = log.seconds
+
+    with _StopSignals() as stop:
+        while done < config.iterations:
+            started = time.monotonic()
+            state, metrics = chunk(state)
+            metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
+            took = time.monotonic() - started
+            training_seconds += took
+            done = int(state.iteration)
+            transitions = done * config.transitions_per_iteration
+            rate = config.chunk * config.transitions_per_iteration / took
+            left = (config.iterations - done) * config.transitions_per_iteration / rate
+            if minutes is not None:
+                left = min(left, minutes * 60 - (time.monotonic() - began))
+            progress.show(_line(transitions, config, rate, left, metrics), final=done >= config.iterations)
+            _check_finite(run, state, config)
+            out_of_time = minutes is not None and time.monotonic() - began + 1.5 * took > minutes * 60
+            stopping = out_of_time or stop.requested
+            if any(done >= m > done - config.chunk for m in milestones) and not stop.requested:
+                evaluation = evaluator(state.ppo)
+                metrics |= {f"eval/{name}": float(value) for name, value in evaluation.as_dict().items()}
+                progress.note(f"evaluation at {transitions:,} transitions, {clock(training_seconds)} of training:")
+                progress.note(table(evaluation))
+                if evaluation.quality >= best:
+                    best = evaluation.quality
+                    run.checkpoints.save(state, best=True)
+                run.checkpoints.save(state)
+            log.write(done, transitions, training_seconds, metrics)
+            if stopping:
+                break
+        run.checkpoints.save(state)
+    log.close()
+    if done < config.iterations:
+        reason = "stopped" if stop.requested else "time is up"
+        progress.note(f"{reason} at {done * config.transitions_per_iteration:,} transitions; saved. Go on with --resume.")
+    return done >= config.iterations
+
+
+def finish(run: Run) -> list[Path]:
+    """Evaluate the run's best policy, and write its table, learning curves and video; the paths written."""
+    trainer, state = run.policy()
+    evaluator = Evaluator(trainer)
+    played = evaluator.play(state.ppo)
+    evaluation = evaluator.measure(played)
+    run.save_evaluation(evaluation)
+    print(f"best policy, {int(state.iteration) * run.config.transitions_per_iteration:,} transitions:\n{table(evaluation)}")
+    paths = [run.folder / "evaluation.json"]
+    if (run.folder / "metrics.csv").exists():
+        curves.learning_curves(run.folder / "metrics.csv", run.folder / "curves.png")
+        paths.append(run.folder / "curves.png")
+    return [*paths, video(run, trainer, played)]
+
+
+def video(run: Run, trainer: Trainer, played, *, seconds: float = 10.0, path: Path | None = None) -> Path:
+    """The policy beside the demonstration, as a video; the path written."""
+    rate = trainer.config.control_rate
+    stride = 2  # 25 pictures a second
+    # The longest episode shows most; ties go to the first.
+    episode = int(np.argmax(played.length))
+    steps = slice(0, min(int(seconds * rate), int(played.length[episode])), stride)
+    frames = render.side_by_side(
+        trainer.robot,
+        played.qpos[steps, episode],
+        trainer.clip.qpos[::stride],
+        labels=("policy", "demonstration"),
+    )
+    return render.write_video(path or run.folder / "policy.mp4", frames, fps=rate / stride)
+
+
+def provenance() -> dict[str, object]:
+    """Command, commit, versions and machine of this process."""
+
+    def git(*arguments: str) -> str | None:
+        try:
+            here = Path(__file__).parent
+            done = subprocess.run(["git", *arguments], cwd=here, capture_output=True, text=True, timeout=10, check=True)
+            return done.stdout.strip()
+        except (OSError, subprocess.SubprocessError):
+            return None
+
+    changes = git("status", "--porcelain", "--untracked-files=no")
+    return {
+        "command": shlex.join(["fmpjax", *sys.argv[1:]]),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": git("rev-parse", "HEAD"),
+        "uncommitted_changes": None if changes is None else bool(changes),
+        "python": platform.python_version(),
+        "packages": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        "device": _device_name(),
+        "cores": len(os.sched_getaffinity(0)),
+    }
+
+
+def _device_name() -> str:
+    device = jax.devices()[0]
+    return f"{len(os.sched_getaffinity(0))} CPU cores" if device.platform == "cpu" else device.device_kind
+
+
+def _evaluation_names() -> list[str]:
+    return [f.name for f in dataclasses.fields(Evaluation) if "tuple" not in str(f.type)] + ["quality"]
+
+
+def _milestones(config: Config) -> list[int]:
+    """Iterations after which to evaluate."""
+    return [max(1, round(share * config.iterations)) for share in config.evaluations]
+
+
+def _best_quality(log: MetricsLog) -> float:
+    return max((float(row["eval/quality"]) for row in log.rows if row.get("eval/quality")), default=-1.0)
+
+
+def _line(transitions: int, config: Config, rate: float, left: float, m: dict[str, float]) -> str:
+    losses = " ".join(
+        f"{name} {m[f'fit/{name}_loss']:.2f}" for name in ("value", "endpoint", "flow") if f"fit/{name}_loss" in m
+    )
+    return (
+        f"{transitions / 1e6:6.2f} of {config.transitions / 1e6:.2f} M | {rate:,.0f}/s, {clock(left)} left | "
+        f"episode {m['train/episode_length']:.0f} of {m['env/cap']:.0f} steps, falls {100 * m['train/falls']:.0f} % | "
+        f"speed {m['train/speed']:+.2f} m/s | reward spread {m['train/reward_spread']:.2f} | {losses}"
+    )
+
+
+def _check_finite(run: Run, state: TrainState, config: Config) -> None:
+    count = int(state.nonfinite)
+    if count <= config.nonfinite_limit:
+        return
+    path = run.folder / "nonfinite_state.npz"
+    np.savez(path, **{name: np.asarray(value) for name, value in state.env.offender._asdict().items()})
+    raise UserError(
+        f"{count} states or updates were not finite, more than nonfinite_limit, {config.nonfinite_limit}: "
+        f"the last state before one is in {path}; a smaller physics.timestep or learning rate may help"
+    )
+
+
+class _StopSignals:
+    """Ctrl-C and SIGTERM ask a run to stop after the chunk in hand; a second Ctrl-C stops at once."""
+
+    def __init__(self):
+        self.requested = False
+
+    def __enter__(self):
+        self._before = {s: signal.signal(s, self._request) for s in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def _request(self, number, frame):
+        if self.requested and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.requested = True
+        print("\nstopping after the iterations in hand, then saving ...", flush=True)
+
+    def __exit__(self, *exception):
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text + "\n")
+    os.replace(partial, path)

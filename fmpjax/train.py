@@ -1,0 +1,139 @@
+"""The training loop: one pure iteration, scanned.
+
+Here all parts meet: rollout, windows, prior, rewards, policy. Nothing in this file knows a method by name.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from fmpjax import features, physics, priors, robots
+from fmpjax.config import Config
+from fmpjax.env import Env, EnvState, Steps
+from fmpjax.errors import UserError
+from fmpjax.motion import MotionClip
+from fmpjax.ppo import PPO, Batch, PPOState
+
+
+class TrainState(NamedTuple):
+    """Everything a run is; what is not here does not exist after a resume."""
+
+    ppo: PPOState
+    prior: Any
+    env: EnvState
+    key: jax.Array
+    iteration: jax.Array  # int32
+    nonfinite: jax.Array  # int32, environments reset and updates skipped so far
+
+
+Metrics = dict[str, jax.Array]
+
+
+class Trainer:
+    """The parts of one run, and the pure functions that train them."""
+
+    def __init__(self, config: Config, clip: MotionClip):
+        priors.check(config.method)
+        if abs(clip.rate - config.control_rate) > 1e-6:
+            raise UserError(
+                f"motion {clip.name} has {clip.rate:g} samples a second: expected the control rate, "
+                f"{config.control_rate:g} Hz"
+            )
+        if clip.robot != config.robot:
+            raise UserError(f"motion {clip.name} is of robot {clip.robot!r}: expected {config.robot!r}")
+        self.config, self.clip = config, clip
+        self.robot = robots.load(config.robot)
+        self.env = Env(self.robot, clip, config, physics.make(self.robot, config.physics))
+        self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo)
+        windows = self.env.clip_windows()
+        self.feature_map = features.fit_feature_map(self.robot, windows, config.features)
+        self.expert_features = self.feature_map(windows)  # [W, D], every window of the demonstration
+        bank = expert_bank_rows(jax.random.PRNGKey(config.seed), len(windows), config.prior.bank)
+        self.prior = priors.make(
+            config.method, self.expert_features[bank], float(self.feature_map.dimension), config.prior
+        )
+
+    def init(self) -> TrainState:
+        """The state at iteration zero, a function of the configuration's seed."""
+        key, ppo_key, prior_key, env_key = jax.random.split(jax.random.PRNGKey(self.config.seed), 4)
+        state = TrainState(
+            ppo=self.ppo.init(ppo_key, self.env.clip_observations),
+            prior=self.prior.init(prior_key),
+            env=self.env.reset(env_key),
+            key=key,
+            iteration=jnp.int32(0),
+            nonfinite=jnp.int32(0),
+        )
+        # A compiled chunk is given its state's buffers to write into, so no two leaves may share one.
+        return jax.tree.map(jnp.copy, state)
+
+    def iteration(self, state: TrainState, _=None) -> tuple[TrainState, Metrics]:
+        """Roll out, fit the reward and score with it, improve the policy."""
+        key, rollout_key, prior_key, ppo_key = jax.random.split(state.key, 4)
+        env, steps = self.env.rollout(state.env, self.ppo.act(state.ppo), rollout_key, self.config.ppo.rollout_steps)
+        windows = self.feature_map(self.env.frame_table(state.env, steps)[steps.window])
+        prior, reward, prior_metrics = self.prior.update(
+            state.prior, priors.Rollout(windows, ~steps.nonfinite), prior_key
+        )
+        ppo, ppo_metrics = self.ppo.update(state.ppo, _batch(steps, reward), ppo_key)
+        skipped = prior_metrics.get("skipped", 0.0) + ppo_metrics["skipped"]
+        nonfinite = state.nonfinite + steps.nonfinite.sum().astype(jnp.int32) + jnp.int32(skipped)
+        metrics = (
+            _rollout_metrics(self.robot, steps, reward)
+            | {f"env/{name}": getattr(env, name) for name in ("cap", "capped_share")}
+            | {f"fit/{name}": value for name, value in prior_metrics.items()}
+            | {f"ppo/{name}": value for name, value in ppo_metrics.items()}
+            | {"train/nonfinite": nonfinite}
+        )
+        metrics = {name: jnp.asarray(value, jnp.float32) for name, value in metrics.items()}
+        return TrainState(ppo, prior, env, key, state.iteration + 1, nonfinite), metrics
+
+    def compile(self, state: TrainState) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
+        """The compiled program of a run: ``config.chunk`` iterations, metrics averaged over them."""
+
+        @partial(jax.jit, donate_argnums=0)
+        def chunk(state: TrainState) -> tuple[TrainState, Metrics]:
+            state, metrics = jax.lax.scan(self.iteration, state, None, length=self.config.chunk)
+            return state, jax.tree.map(jnp.nanmean, metrics)
+
+        return chunk.lower(state).compile()
+
+
+def expert_bank_rows(key: jax.Array, windows: int, size: int) -> jax.Array:
+    """Windows ``[size]`` of the expert bank: spread evenly over the demonstration, repeated where it is shorter.
+
+    An even spread is a stratified draw: it has the uniform draw's mean and less variance.
+    """
+    offset = jax.random.uniform(key)
+    return jnp.floor((jnp.arange(size) + offset) * windows / size).astype(jnp.int32)
+
+
+def _batch(steps: Steps, reward: jax.Array) -> Batch:
+    return Batch(
+        observation=steps.observation,
+        next_observation=steps.next_observation,
+        action=steps.action,
+        mean=steps.extras["mean"],
+        deviation=steps.extras["deviation"],
+        reward=reward,
+        fell=steps.fell,
+        timed_out=steps.timed_out,
+    )
+
+
+def _rollout_metrics(robot: robots.Robot, steps: Steps, reward: jax.Array) -> Metrics:
+    ended = steps.fell | steps.timed_out
+    count = ended.sum()
+    low, middle, high = jnp.quantile(reward, jnp.array([0.25, 0.5, 0.75]))
+    return {
+        # NaN where no episode ended in the rollout; averages over a chunk leave it out.
+        "train/episode_length": jnp.where(count > 0, (steps.length * ended).sum() / count, jnp.nan),
+        "train/falls": jnp.where(count > 0, steps.fell.sum() / count, jnp.nan),
+        "train/speed": steps.frame[..., features.velocity_index(robot)].mean(),
+        "train/reward": reward.mean(),
+        "train/reward_spread": high - low,
+        "train/reward_median": middle,
+    }

@@ -1,0 +1,121 @@
+"""Learning curves of a run, from its ``metrics.csv``."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from fmpjax.errors import UserError
+
+# What a reader asks first stands first; columns that are not named here follow under their own names.
+TITLES = {
+    "train/episode_length": "episode length",
+    "train/falls": "falls in training",
+    "train/speed": "speed in training, m/s",
+    "eval/late_speed": "evaluation: late speed, m/s",
+    "eval/falls": "evaluation: falls",
+    "eval/excursion": "evaluation: excursion",
+    "train/reward_spread": "spread of the reward",
+    "fit/value_loss": "value loss",
+    "fit/endpoint_loss": "endpoint loss",
+    "fit/flow_loss": "flow loss",
+    "ppo/kl": "PPO: KL divergence",
+    "ppo/deviation": "PPO: action deviation",
+    "env/cap": "cap of the episode length",
+}
+COUNTERS = ("iteration", "transitions", "seconds")
+COLUMNS = 4
+SPARSE = 0.5  # a curve with values in fewer rows than this is drawn as points
+COLOURS = {"train": "#2a6fb0", "eval": "#c8553d", "fit": "#3a8a6b", "ppo": "#7a5ba6"}
+OTHER_COLOUR = "#5b6673"
+
+
+def learning_curves(csv_path: str | Path, png_path: str | Path) -> Path:
+    """Draw every metric of a run over its transitions as small panels of one PNG; returns its path.
+
+    Thin lines are the values, thick ones their running mean. Columns without a value are left out.
+
+    Raises:
+      UserError: the table cannot be read or has no metrics, or the picture cannot be written.
+    """
+    csv_path, png_path = Path(csv_path), Path(png_path)
+    table = _read(csv_path)
+    names = [name for name in TITLES if name in table]
+    names += [name for name in table if name not in TITLES and name not in COUNTERS]
+    names = [name for name in names if np.isfinite(table[name]).any()]
+    if not names:
+        raise UserError(f"{csv_path} has no metrics to draw: expected rows with columns such as {next(iter(TITLES))}")
+    across, label = _horizontal(table)
+    columns = min(COLUMNS, len(names))
+    rows = -(-len(names) // columns)
+    figure = Figure((3.2 * columns, 2.1 * rows + 0.2), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    for panel, name in zip(panels.flat, names, strict=False):
+        _draw(panel, name, across, table[name])
+    for panel in panels.flat[len(names) :]:
+        panel.set_visible(False)
+    for column in range(columns):
+        lowest = panels[(len(names) - 1 - column) // columns, column]
+        lowest.set_xlabel(label, fontsize=8)
+        lowest.tick_params(labelbottom=True)
+    try:
+        png_path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(png_path, format="png")
+    except OSError as error:
+        raise UserError(f"cannot write {png_path}: {error.strerror or error}") from error
+    return png_path
+
+
+def _draw(panel, name: str, across: np.ndarray, values: np.ndarray) -> None:
+    colour = COLOURS.get(name.split("/")[0], OTHER_COLOUR)
+    known = np.isfinite(values)
+    x, y = across[known], values[known]
+    if known.mean() < SPARSE or len(y) < 3:
+        panel.plot(x, y, color=colour, linewidth=1.2, marker="o", markersize=3.5)
+    else:
+        panel.plot(x, y, color=colour, linewidth=0.7, alpha=0.35)
+        panel.plot(x, _running_mean(y, max(1, len(y) // 50)), color=colour, linewidth=1.6)
+    panel.set_title(TITLES.get(name, name), fontsize=9, loc="left")
+    panel.tick_params(labelsize=7, length=2)
+    panel.grid(alpha=0.25, linewidth=0.5)
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.margins(x=0.02)
+
+
+def _running_mean(y: np.ndarray, half: int) -> np.ndarray:
+    """Mean of ``y [n]`` over ``half`` neighbours on either side, fewer at the ends."""
+    total = np.concatenate([[0.0], np.cumsum(y)])
+    low = np.maximum(np.arange(len(y)) - half, 0)
+    high = np.minimum(np.arange(len(y)) + half + 1, len(y))
+    return (total[high] - total[low]) / (high - low)
+
+
+def _horizontal(table: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
+    """Values and label of the horizontal axis: transitions where the table has them, else iterations or rows."""
+    if np.isfinite(table.get("transitions", np.nan)).any():
+        return table["transitions"] / 1e6, "million transitions"
+    if np.isfinite(table.get("iteration", np.nan)).any():
+        return table["iteration"], "iteration"
+    return np.arange(len(next(iter(table.values()))), dtype=float), "row"
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    """Columns of the table, ``[rows]`` each; NaN where a cell is empty or, in a run's last row, not yet written."""
+    try:
+        with path.open(newline="") as file:
+            reader = csv.DictReader(file)
+            rows = list(reader)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"cannot read {path}: {reason}") from error
+    return {name: np.array([_number(row[name]) for row in rows]) for name in reader.fieldnames or ()}
+
+
+def _number(cell: str | None) -> float:
+    try:
+        return float(cell or "nan")
+    except ValueError:
+        return np.nan
