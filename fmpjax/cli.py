@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+import warnings
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated
@@ -169,6 +170,8 @@ def main(arguments: list[str] | None = None) -> None:
     command = tyro.extras.subcommand_cli_from_dict(
         commands, prog="fmpjax", description="Flow-Matched Motion Priors in JAX.", args=arguments
     )
+    # The video encoder is a child process; it is started by exec at once and never touches JAX's threads.
+    warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
     try:
         command()
     except UserError as error:

@@ -140,7 +140,9 @@ class Env:
             cap=jnp.float32(self.config.first_cap),
             capped_share=jnp.float32(0.0),
             cap_age=jnp.int32(0),
-            offender=Offender(*(jnp.zeros(n) for n in (state.qpos.shape[-1], state.qvel.shape[-1], len(self.actions.low)))),
+            offender=Offender(
+                *(jnp.zeros(n) for n in (state.qpos.shape[-1], state.qvel.shape[-1], len(self.actions.low)))
+            ),
         )
 
     def reset(self, key: jax.Array) -> EnvState:
@@ -189,7 +191,13 @@ class Env:
 
             sim = jax.tree.map(choose, physics.reset(qpos[start], qvel[start]), sim)
             observed = jax.tree.map(lambda t, o: choose(t[start], o), table, reached)
-            carry = (sim, observed, choose(jnp.zeros_like(age), age), choose(self.history_rows(start), window), offender)
+            carry = (
+                sim,
+                observed,
+                choose(jnp.zeros_like(age), age),
+                choose(self.history_rows(start), window),
+                offender,
+            )
             return carry, record
 
         window = before + jnp.arange(count * self.horizon).reshape(count, self.horizon)

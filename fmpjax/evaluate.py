@@ -144,9 +144,7 @@ class Evaluator:
             excursion_n=excursion.n,
             amplitude_mae=metrics.summarise(metrics.amplitude_mae(ranges, expert)).mean,
             sinkhorn=self._sinkhorn(played, detail),
-            contact_foot_speed=metrics.summarise(
-                metrics.contact_foot_speed(feet, contact, length, rate=rate)
-            ).mean,
+            contact_foot_speed=metrics.summarise(metrics.contact_foot_speed(feet, contact, length, rate=rate)).mean,
             imbalance=metrics.summarise(metrics.left_right_imbalance(ranges)).mean,
             displacement=metrics.summarise(displacement).mean,
             demonstration_speed=float(np.linalg.norm(planar, axis=-1).mean() * clip.rate),

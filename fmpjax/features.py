@@ -78,8 +78,8 @@ def _joint_rotations(robot: Robot, joints: jax.Array) -> jax.Array:
 def actor_observation(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """The policy's observation, ``[..., 237]`` for 29 joints.
 
-    Root height (m), root rotation 6D, root velocity (m/s) and angular velocity (rad/s) in world axes, joint rotations 6D,
-    joint velocities (rad/s), key points less the root (m).
+    Root height (m), root rotation 6D, root velocity (m/s) and angular velocity (rad/s) in world axes, joint rotations
+    6D, joint velocities (rad/s), key points less the root (m).
 
     Args:
       qpos: ``[..., 7 + J]`` root xyz, quaternion wxyz, joints.
@@ -103,8 +103,8 @@ def actor_observation(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Arr
 def prior_window(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """The prior's window before normalisation, ``[..., H * 239]`` for 29 joints, oldest frame first.
 
-    A frame is root position (m; x and y relative to the newest frame, z absolute), root rotation 6D, joint rotations 6D,
-    key points less that frame's root (m), root velocity (m/s), root angular velocity (rad/s), joint velocities (rad/s).
+    A frame is root position (m; x and y relative to the newest frame, z absolute), root rotation 6D, joint rotations
+    6D, key points less that frame's root (m), root velocity (m/s), root angular velocity (rad/s), joint velocities (rad/s).
 
     Args:
       qpos: ``[..., H, 7 + J]`` states, oldest first.

@@ -1,8 +1,8 @@
 """Forward kinematics of a batch of configurations, on the device.
 
-Body poses follow from the hinges by pointer doubling: after round r every body knows its pose relative to its ancestor
-2^r levels up, so a tree of depth D takes log2(D) rounds of batched quaternion products. That compiles in a second, where
-an unrolled chain of 30 bodies takes minutes.
+Body poses follow from the hinges by pointer doubling: after round r every body knows its pose relative to its
+ancestor 2^r levels up, so a tree of depth D takes log2(D) rounds of batched quaternion products. That compiles in a
+second, where an unrolled chain of 30 bodies takes minutes.
 """
 
 from typing import NamedTuple

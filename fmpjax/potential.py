@@ -1,7 +1,7 @@
 """The three-head scalar potential and its derivatives (section III-C of the paper).
 
-U^k(x, tau) = -|x|^2 / 2 + a_k . x + residual_k(sqrt(d) x, tau) for k in (expert, self 1, self 2), and the score that the
-reward reads, S(x) = U^E(x, 0) - (U^P1(x, 0) + U^P2(x, 0)) / 2, in which the quadratic terms cancel.
+U^k(x, tau) = -|x|^2 / 2 + a_k . x + residual_k(sqrt(d) x, tau) for k in (expert, self 1, self 2), and the score that
+the reward reads, S(x) = U^E(x, 0) - (U^P1(x, 0) + U^P2(x, 0)) / 2, in which the quadratic terms cancel.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """Proximal policy optimisation (section IV-A of the paper; the settings are MimicKit's).
 
-Networks, the action distribution and the running observation statistics are Brax's. An update fits the critic to TD(lambda)
-returns first and then improves the actor, each for its own number of epochs.
+Networks, the action distribution and the running observation statistics are Brax's. An update fits the critic to
+TD(lambda) returns first and then improves the actor, each for its own number of epochs.
 """
 
 from typing import Any, NamedTuple
@@ -214,9 +214,7 @@ class PPO:
             direction, new_optimizer_state = self._optimizer.update(gradients, optimizer_state)
             new_params = jax.tree.map(lambda p, d: p - rate * d, params, direction)
             finite = jnp.isfinite(value) & jnp.isfinite(norm)
-            carry = jax.tree.map(
-                lambda new, old: jnp.where(finite, new, old), (new_params, new_optimizer_state), carry
-            )
+            carry = jax.tree.map(lambda new, old: jnp.where(finite, new, old), (new_params, new_optimizer_state), carry)
             stats = stats | {"loss": value, "gradient_norm": norm, "skipped": (~finite).astype(jnp.float32)}
             return carry, stats
 
@@ -247,7 +245,7 @@ def generalized_advantage(reward, value, next_value, fell, timed_out, discount: 
 
 
 def adapt_rate(rate: jax.Array, kl: jax.Array, target: float) -> jax.Array:
-    """Learning rate divided by 1.5 where the KL divergence is over twice the target, multiplied where under half of it."""
+    """Learning rate over 1.5 where the KL divergence is above twice the target, times 1.5 below half of it."""
     if not target:
         return rate
     factor = jnp.where(kl > 2.0 * target, 1 / 1.5, jnp.where(kl < 0.5 * target, 1.5, 1.0))

@@ -15,6 +15,8 @@ import numpy as np
 from fmpjax import resources
 from fmpjax.errors import UserError
 
+_LOOKS = 1  # geom group of what only the eye sees
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Robot:
@@ -56,8 +58,14 @@ class Robot:
         return len(self.joint_names)
 
     def physics_model(self, **options) -> mujoco.MjModel:
-        """A copy of the model with other solver options, e.g. ``timestep=0.01``; ``frictionloss`` is per joint, N m."""
-        model = mujoco.MjModel.from_xml_path(str(resources.folder("robots") / self.name / "robot.xml"))
+        """The model without its looks, which cost time in every step, and with other solver options.
+
+        Options are fields of ``model.opt``, e.g. ``timestep=0.01`` (s), and ``frictionloss`` (N m, every hinge).
+        """
+        spec = mujoco.MjSpec.from_file(str(resources.folder("robots") / self.name / "robot.xml"))
+        for geom in [g for g in spec.geoms if g.group == _LOOKS]:
+            spec.delete(geom)
+        model = spec.compile()
         if "frictionloss" in options:
             model.dof_frictionloss[6:] = options.pop("frictionloss")
         for key, value in options.items():

@@ -1,7 +1,8 @@
 """Quaternion and 6D rotation algebra on NumPy or JAX arrays.
 
-Quaternions are unit, scalar first (``_wxyz``), components on the last axis. Every function takes leading axes freely and
-computes with the array library of its first argument, so the same code serves clips on the host and states on the device.
+Quaternions are unit, scalar first (``_wxyz``), components on the last axis. Every function takes leading axes freely
+and computes with the array library of its first argument, so the same code serves clips on the host and states on the
+device.
 """
 
 import jax
@@ -60,7 +61,7 @@ def log_map(q_wxyz):
 
 
 def slerp(a_wxyz, b_wxyz, fraction):
-    """Shortest-arc interpolation from ``a_wxyz`` to ``b_wxyz``; ``fraction`` in [0, 1] broadcasts against ``[..., 1]``."""
+    """Shortest-arc interpolation from ``a_wxyz`` to ``b_wxyz``; ``fraction [..., 1]`` is in [0, 1]."""
     return multiply(a_wxyz, exp_map(fraction * log_map(multiply(conjugate(a_wxyz), b_wxyz))))
 
 

@@ -91,9 +91,7 @@ class Run:
     def trainer(self) -> Trainer:
         """The run's parts."""
         config = self.config
-        clip = motion.load(
-            self.folder / "demonstration.npz", rate=round(config.control_rate, 6), robot=config.robot
-        )
+        clip = motion.load(self.folder / "demonstration.npz", rate=round(config.control_rate, 6), robot=config.robot)
         return Trainer(config, clip)
 
     def policy(self, *, best: bool = True) -> tuple[Trainer, TrainState]:
@@ -114,7 +112,9 @@ def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> bo
     """
     config, progress = run.config, Progress()
     began = time.monotonic()
-    progress.note(f"run {run.folder}: {config.method}, {config.preset}, {config.env.reset} reset, motion {config.motion}")
+    progress.note(
+        f"run {run.folder}: {config.method}, {config.preset}, {config.env.reset} reset, motion {config.motion}"
+    )
     trainer = run.trainer()
     state = trainer.init()
     if resume and run.checkpoints.latest() is not None:
@@ -124,12 +124,10 @@ def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> bo
     if done >= config.iterations:
         progress.note(f"the budget of {config.transitions:,} transitions is spent already")
         return True
-    progress.note(
-        f"{trainer.env.physics.name} physics on {_device_name()}; compiling, which takes a minute or so ..."
-    )
+    progress.note(f"{trainer.env.physics.name} physics on {_device_name()}; compiling, which takes a minute or so ...")
     compile_began = time.monotonic()
     chunk = trainer.compile(state)
-    progress.note(f"compiled in {time.monotonic() - compile_began:.0f} s; {config.iterations * config.transitions_per_iteration:,} transitions to go to")
+    progress.note(f"compiled in {time.monotonic() - compile_began:.0f} s")
     names = [f"eval/{name}" for name in _evaluation_names()]
     metric_names = sorted(jax.eval_shape(trainer.iteration, state)[1])
     log = MetricsLog(run.folder, [*metric_names, *names], done)
@@ -170,7 +168,7 @@ def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> bo
     log.close()
     if done < config.iterations:
         reason = "stopped" if stop.requested else "time is up"
-        progress.note(f"{reason} at {done * config.transitions_per_iteration:,} transitions; saved. Go on with --resume.")
+        progress.note(f"{reason} at {transitions:,} transitions; saved. Go on with --resume.")
     return done >= config.iterations
 
 
@@ -181,7 +179,8 @@ def finish(run: Run) -> list[Path]:
     played = evaluator.play(state.ppo)
     evaluation = evaluator.measure(played)
     run.save_evaluation(evaluation)
-    print(f"best policy, {int(state.iteration) * run.config.transitions_per_iteration:,} transitions:\n{table(evaluation)}")
+    transitions = int(state.iteration) * trainer.config.transitions_per_iteration
+    print(f"best policy, {transitions:,} transitions:\n{table(evaluation)}")
     paths = [run.folder / "evaluation.json"]
     if (run.folder / "metrics.csv").exists():
         curves.learning_curves(run.folder / "metrics.csv", run.folder / "curves.png")

@@ -52,9 +52,8 @@ class Trainer:
         self.feature_map = features.fit_feature_map(self.robot, windows, config.features)
         self.expert_features = self.feature_map(windows)  # [W, D], every window of the demonstration
         bank = expert_bank_rows(jax.random.PRNGKey(config.seed), len(windows), config.prior.bank)
-        self.prior = priors.make(
-            config.method, self.expert_features[bank], float(self.feature_map.dimension), config.prior
-        )
+        self.expert_bank = self.expert_features[bank]  # [m, D], E of the paper
+        self.prior = priors.make(config.method, self.expert_bank, float(self.feature_map.dimension), config.prior)
 
     def init(self) -> TrainState:
         """The state at iteration zero, a function of the configuration's seed."""

@@ -1,7 +1,7 @@
 """Entropic optimal transport between a rollout bank and the expert bank (section III-B of the paper).
 
-Quadratic cost c(x, y) = |x - y|^2 / 2, uniform masses. ott-jax solves; the dual extensions, scores, gradients and matching
-probabilities follow in closed form. Only score differences and gradients mean anything.
+Quadratic cost c(x, y) = |x - y|^2 / 2, uniform masses. ott-jax solves; the dual extensions, scores, gradients and
+matching probabilities follow in closed form. Only score differences and gradients mean anything.
 """
 
 from typing import NamedTuple

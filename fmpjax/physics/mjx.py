@@ -34,7 +34,9 @@ class MjxPhysics:
         except (ImportError, RuntimeError) as error:
             if config.impl != "warp":
                 raise
-            raise UserError(f"physics.impl is 'warp', which this installation lacks ({error}): install fmpjax[warp]") from None
+            raise UserError(
+                f"physics.impl is 'warp', which this installation lacks ({error}): install fmpjax[warp]"
+            ) from None
 
     def step(self, state: PhysicsState, targets: jax.Array) -> PhysicsState:
         def one(qpos, qvel, warmstart, target):

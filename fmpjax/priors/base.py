@@ -20,11 +20,13 @@ class Rollout(NamedTuple):
 class MotionPrior(NamedTuple):
     """A learned reward.
 
+    ``init(key)``, ``update(state, rollout, key) -> (state, reward [T, N], metrics)``, ``score(state, features)``.
     ``update`` owns its order: transport priors fit and then score, a discriminator scores and then fits.
     """
 
     init: Callable[[jax.Array], PriorState]
     update: Callable[[PriorState, Rollout, jax.Array], tuple[PriorState, jax.Array, Metrics]]
+    score: Callable[[PriorState, jax.Array], jax.Array]  # of features [n, D], higher is better, before normalisation
 
 
 class Reward(NamedTuple):
@@ -36,7 +38,7 @@ class Reward(NamedTuple):
 
 
 def median_reward(score: jax.Array, valid: jax.Array, spread_floor: float) -> Reward:
-    """r = 2 sigmoid((S - median) / max(IQR, floor)) over the rollout's valid windows (eq. reward), 0 elsewhere."""
+    """R = 2 sigmoid((S - median) / max(IQR, floor)) over the rollout's valid windows (eq. reward), 0 elsewhere."""
     low, middle, high = jnp.nanquantile(jnp.where(valid, score, jnp.nan), jnp.array([0.25, 0.5, 0.75]))
     reward = 2.0 * jax.nn.sigmoid((score - middle) / jnp.maximum(high - low, spread_floor))
     return Reward(jnp.where(valid & jnp.isfinite(reward), reward, 0.0), middle, high - low)

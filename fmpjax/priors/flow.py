@@ -95,7 +95,7 @@ def sample_flow(key, query, teacher: Teacher, source, expert) -> Flow:
 
 
 def losses(params, query, teacher: Teacher, flow: Flow, dimension, config: PriorConfig):
-    """Weighted sum of the losses and each of them (eqs. value, endpoint, flow).
+    """Weighted sum of the losses, and statistics: each of them, the correlation of values (eqs. value to flow).
 
     Queries at time zero and flow points go through the network as one batch.
     """
@@ -113,10 +113,13 @@ def losses(params, query, teacher: Teacher, flow: Flow, dimension, config: Prior
         values, gradients = potential.contrast(params, query, jnp.zeros(count), contrast, dimension)
     if config.endpoint_weight:
         terms["endpoint"] = jnp.mean(jnp.sum((gradients - teacher.gradient) ** 2, axis=-1))
-    error = (values - values.mean()) - (teacher.score - teacher.score.mean())
-    terms["value"] = jnp.mean(error**2) / config.value_scale**2
+    centered, target = values - values.mean(), teacher.score - teacher.score.mean()
+    terms["value"] = jnp.mean((centered - target) ** 2) / config.value_scale**2
     total = sum(getattr(config, f"{name}_weight") * term for name, term in terms.items())
-    return total, terms
+    stats = {f"{name}_loss": term for name, term in terms.items()}
+    product = jnp.sum(centered**2) * jnp.sum(target**2)
+    stats["value_correlation"] = jnp.sum(centered * target) / jnp.sqrt(jnp.maximum(product, 1e-30))
+    return total, stats
 
 
 def make(expert_bank: jax.Array, dimension: float, config: PriorConfig) -> MotionPrior:
@@ -129,6 +132,9 @@ def make(expert_bank: jax.Array, dimension: float, config: PriorConfig) -> Motio
         params = potential.init(key, expert_bank.shape[-1], dimension, config.hidden)
         return FlowState(params, optimizer.init(params), params)
 
+    def score(state: FlowState, x):
+        return potential.score(state.average, x, dimension)
+
     def fit_once(carry, key, pool, query_pool):
         params, optimizer_state, average = carry
         bank_key, query_key, flow_key = jax.random.split(key, 3)
@@ -139,7 +145,7 @@ def make(expert_bank: jax.Array, dimension: float, config: PriorConfig) -> Motio
             query = query_pool[jax.random.randint(query_key, (config.minibatch,), 0, len(query_pool))]
             teacher = teach(source, expert_bank, query, dimension, config)
         flow = sample_flow(flow_key, query, teacher, source, expert_bank)
-        (total, terms), gradients = jax.value_and_grad(losses, has_aux=True)(
+        (total, stats), gradients = jax.value_and_grad(losses, has_aux=True)(
             params, query, teacher, flow, dimension, config
         )
         norm = optax.global_norm(gradients)
@@ -149,15 +155,12 @@ def make(expert_bank: jax.Array, dimension: float, config: PriorConfig) -> Motio
         params = keep(optax.apply_updates(params, updates), params)
         optimizer_state = keep(new_optimizer_state, optimizer_state)
         average = jax.tree.map(lambda a, p: a + newest * (p - a), average, params)
-        metrics = {f"{name}_loss": term for name, term in terms.items()} | {
+        metrics = stats | {
             "gradient_norm": norm,
             "epsilon": teacher.solution.epsilon,
             "sinkhorn_iterations": teacher.solution.iterations.max(),
             "unconverged": (~teacher.solution.converged).sum().astype(jnp.float32),
             "skipped": (~finite).astype(jnp.float32),
-            "value_correlation": _correlation(
-                potential.score(params, query, dimension), teacher.score
-            ),
         }
         return (params, optimizer_state, average), metrics
 
@@ -174,24 +177,18 @@ def make(expert_bank: jax.Array, dimension: float, config: PriorConfig) -> Motio
             jax.random.split(key, config.updates),
         )
         state = FlowState(*carry)
-        scores = potential.score(state.average, pool, dimension).reshape(steps, count)
+        scores = score(state, pool).reshape(steps, count)
         result = median_reward(scores, rollout.valid, config.spread_floor)
         summary = {name: values.mean() for name, values in metrics.items()}
         for name in ("unconverged", "skipped"):
             summary[name] = metrics[name].sum()
-        expert_scores = potential.score(state.average, expert_bank, dimension)
         summary |= {
             "score_median": result.median,
             "score_spread": result.spread,
             # Where the demonstration stands in the reward's own units.
-            "expert_margin": (jnp.mean(expert_scores) - result.median)
+            "expert_margin": (score(state, expert_bank).mean() - result.median)
             / jnp.maximum(result.spread, config.spread_floor),
         }
         return state, result.reward, summary
 
-    return MotionPrior(init, update)
-
-
-def _correlation(a, b):
-    a, b = a - a.mean(), b - b.mean()
-    return jnp.sum(a * b) / jnp.sqrt(jnp.maximum(jnp.sum(a * a) * jnp.sum(b * b), 1e-30))
+    return MotionPrior(init, update, score)

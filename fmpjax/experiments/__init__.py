@@ -1,0 +1,1 @@
+"""Experiments on trained or untrained priors, one module per table or figure."""

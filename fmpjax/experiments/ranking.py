@@ -1,0 +1,154 @@
+"""How the fitted reward ranks the demonstration against spoiled copies of itself.
+
+The prior is fitted to the windows of a fixed policy (an untrained one, or a run's) and then scores the demonstration
+and copies that are frozen, slowed, reversed, shuffled in time, and noisy. A reward is of use where the copies lose. Run as
+``python -m fmpjax.experiments.ranking --run RUN`` or, for the start of training, with ``--start``.
+"""
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from fmpjax import features, priors
+from fmpjax.errors import UserError
+from fmpjax.motion import MotionClip, resample
+from fmpjax.ppo import PPOState
+from fmpjax.train import Trainer
+
+
+def copies(trainer: Trainer, seed: int = 0) -> dict[str, np.ndarray]:
+    """Features ``[W, D]`` of the demonstration's windows and of its spoiled copies."""
+    clip, horizon = trainer.clip, trainer.env.horizon
+    rng = np.random.default_rng(seed)
+
+    def windows(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        frames = _frames(trainer, qpos, qvel)
+        starts = np.arange(len(frames) - horizon + 1)[:, None]
+        return frames[starts + np.arange(horizon)]
+
+    def of(motion: MotionClip) -> np.ndarray:
+        return windows(motion.qpos, motion.qvel)
+
+    slow = MotionClip.from_qpos("slow", clip.robot, clip.rate, resample(clip.qpos, clip.rate, 2 * clip.rate))
+    reverse = MotionClip.from_qpos("reverse", clip.robot, clip.rate, clip.qpos[::-1])
+    noisy_qpos, noisy_qvel = clip.qpos.copy(), clip.qvel.copy()
+    noisy_qpos[:, 7:] += rng.normal(0.0, 0.1, clip.qpos[:, 7:].shape)
+    noisy_qvel[:, 6:] += rng.normal(0.0, 1.0, clip.qvel[:, 6:].shape)
+    demonstration = windows(clip.qpos, clip.qvel)
+    still = _frames(trainer, clip.qpos, np.zeros_like(clip.qvel))
+    order = np.stack([rng.permutation(horizon) for _ in demonstration])
+    rows = {
+        "demonstration": demonstration,
+        "frozen": np.repeat(still[horizon - 1 :, None], horizon, axis=1),
+        "slowed to half": of(slow),
+        "reversed": of(reverse),
+        "shuffled in time": np.take_along_axis(demonstration, order[..., None], axis=1),
+        "noisy (0.1 rad, 1 rad/s)": windows(noisy_qpos, noisy_qvel),
+    }
+    return {name: np.asarray(trainer.feature_map(jnp.asarray(value))) for name, value in rows.items()}
+
+
+def _frames(trainer: Trainer, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    observed = features.observe(
+        trainer.robot, jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32), "compact"
+    )
+    return np.asarray(observed.frame)
+
+
+def pool(
+    trainer: Trainer, policy: PPOState, key: jax.Array, steps: int = 256, last: int = 32
+) -> tuple[jax.Array, float]:
+    """Windows of a policy, episodes at full length.
+
+    Returns:
+      Features ``[last, N, D]`` of the last of ``steps`` control steps, and their mean forward speed, m/s.
+    """
+    env = trainer.env
+    state = env.reset(key)._replace(cap=jnp.float32(trainer.config.env.episode_steps))
+    play = jax.jit(lambda state, key: env.rollout(state, trainer.ppo.act(policy), key, last))
+    for chunk_key in jax.random.split(key, max(1, steps // last)):
+        before = state
+        state, record = play(state, chunk_key)
+    speed = float(record.frame[..., features.velocity_index(trainer.robot)].mean())
+    return trainer.feature_map(env.frame_table(before, record)[record.window]), speed
+
+
+def rank(trainer: Trainer, windows: jax.Array, key: jax.Array, updates: int = 512) -> dict[str, dict[str, float]]:
+    """Fit the prior to ``windows [T, N, D]`` and score the copies.
+
+    Returns:
+      By copy: mean reward, and the share of windows that a random window of the demonstration beats.
+    """
+    config = dataclasses.replace(trainer.config.prior, updates=updates)
+    prior = priors.make(trainer.config.method, trainer.expert_bank, float(trainer.feature_map.dimension), config)
+    init_key, fit_key, reward_key = jax.random.split(key, 3)
+    valid = jnp.ones(windows.shape[:2], bool)
+    fit = jax.jit(prior.update)
+    state, _, metrics = fit(prior.init(init_key), priors.Rollout(windows, valid), fit_key)
+    score = jax.jit(lambda x: prior.score(state, x))
+    median, spread = float(metrics["score_median"]), max(float(metrics["score_spread"]), config.spread_floor)
+    scores = {name: np.asarray(score(jnp.asarray(x))) for name, x in copies(trainer).items()}
+    rng = np.random.default_rng(0)
+    good = rng.choice(scores["demonstration"], 4096)
+    return {
+        name: {
+            # The logistic saturates far from the pool; the margin, in spreads of the pool, does not.
+            "reward": float(np.mean(2 / (1 + np.exp(-(s - median) / spread)))),
+            "margin": float((s.mean() - median) / spread),
+            "beaten": float(np.mean(good > rng.choice(s, 4096))),
+        }
+        for name, s in scores.items()
+    } | {"pool": {"reward": 1.0, "margin": 0.0, "beaten": float(np.mean(good > median))}}
+
+
+def table(ranking: dict[str, dict[str, float]]) -> str:
+    """The ranking for people."""
+    lines = [f"  {'windows':<26} {'reward':>7} {'margin':>8}  loses to the demonstration"]
+    lines += [
+        f"  {name:<26} {row['reward']:7.3f} {row['margin']:8.2f}  {100 * row['beaten']:5.1f} %"
+        for name, row in ranking.items()
+    ]
+    return "\n".join(lines)
+
+
+def main(run: Path, start: bool = False, last: bool = False, updates: int = 512, out: Path | None = None) -> None:
+    """Rank the demonstration and its copies under a reward fitted to a policy's windows.
+
+    Args:
+      run: folder of the run.
+      start: take the untrained policy.
+      last: take the newest checkpoint in place of the best.
+      updates: reward-model updates of the fit.
+      out: JSON file to write, RUN/ranking.json by default.
+    """
+    from fmpjax import runs
+
+    opened = runs.Run.open(run)
+    if start:
+        trainer = opened.trainer()
+        policy = trainer.init().ppo
+    else:
+        trainer, state = opened.policy(best=not last)
+        policy = state.ppo
+    windows, speed = pool(trainer, policy, jax.random.PRNGKey(0), steps=32 if start else 256)
+    ranking = rank(trainer, windows, jax.random.PRNGKey(1), updates)
+    print(f"pool: {windows.shape[0] * windows.shape[1]} windows, mean forward speed {speed:.3f} m/s")
+    print(table(ranking))
+    path = out or opened.folder / "ranking.json"
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps({"pool_speed": speed, "updates": updates, "windows": ranking}, indent=1) + "\n")
+    os.replace(partial, path)
+    print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(main)
+    except UserError as error:
+        raise SystemExit(f"fmpjax: {error}") from None

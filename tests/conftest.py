@@ -1,0 +1,42 @@
+"""What the tests share. ``FMPJAX_TEST_DATA`` may name a folder with data that is not shipped; tests pass without it."""
+
+import os
+from pathlib import Path
+
+# Before JAX is imported: the figures the tests compare are those of the CPU unless the caller says otherwise.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import pytest
+
+from fmpjax import motion, robots
+
+
+@pytest.fixture(scope="session")
+def robot():
+    return robots.load("unitree_g1")
+
+
+@pytest.fixture(scope="session")
+def walk():
+    return motion.load("walk")
+
+
+@pytest.fixture(scope="session")
+def data():
+    """Folder of the recorded figures."""
+    return Path(__file__).parent / "data"
+
+
+@pytest.fixture(scope="session")
+def external():
+    """A function from a file's name to its path below ``FMPJAX_TEST_DATA``; it skips the test without one."""
+
+    def find(name: str) -> Path:
+        if "FMPJAX_TEST_DATA" not in os.environ:
+            pytest.skip("FMPJAX_TEST_DATA names no data folder")
+        found = sorted(Path(os.environ["FMPJAX_TEST_DATA"]).rglob(name))
+        if not found:
+            pytest.skip(f"no {name} there")
+        return found[0]
+
+    return find

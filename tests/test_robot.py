@@ -1,0 +1,271 @@
+"""The shipped G1 against the maker's, and forward kinematics and floor tests against MuJoCo's own.
+
+``data/g1_figures.json`` is what `figures` gives for the maker's ``g1_29dof_rev_1_0`` model at three configurations.
+"""
+
+import json
+import re
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from fmpjax import kinematics, robots
+from fmpjax.errors import UserError
+
+# Rotor inertia about the joint, kg m^2, by motor (maker's tables): the ankles, waist roll and waist pitch have two each.
+MOTOR_5020, MOTOR_7520_14, MOTOR_7520_22, MOTOR_4010 = 0.003609725, 0.010177520, 0.025101925, 0.00425
+ARMATURE = [
+    (r"hip_(pitch|yaw)|waist_yaw", MOTOR_7520_14),
+    (r"hip_roll|knee", MOTOR_7520_22),
+    (r"ankle|waist_(roll|pitch)", 2 * MOTOR_5020),
+    (r"shoulder|elbow|wrist_roll", MOTOR_5020),
+    (r"wrist_(pitch|yaw)", MOTOR_4010),
+]
+
+
+def figures(model, configurations):
+    """Bodies, joints and body poses of a model whose joint 0 is the root, by name."""
+    data = mujoco.MjData(model)
+    bodies, joints, poses = {}, {}, []
+    for i in range(1, model.nbody):
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.body_iquat[i])
+        turn = turn.reshape(3, 3)
+        bodies[model.body(i).name] = {
+            "mass": float(model.body_mass[i]),
+            "com": model.body_ipos[i].tolist(),
+            "inertia": (turn @ np.diag(model.body_inertia[i]) @ turn.T).tolist(),
+        }
+    for i in range(1, model.njnt):
+        joints[model.joint(i).name] = {
+            "body": model.body(model.jnt_bodyid[i]).name,
+            "axis": model.jnt_axis[i].tolist(),
+            "range": model.jnt_range[i].tolist(),
+            "effort": model.jnt_actfrcrange[i].tolist(),
+        }
+    for qpos in configurations:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        poses.append({"qpos": list(qpos), "position": data.xpos[1:].tolist(), "rotation_wxyz": data.xquat[1:].tolist()})
+    return {"bodies": bodies, "joints": joints, "poses": poses}
+
+
+def assert_same(actual, expected, path=""):
+    """Equal structure and order; numbers to the seven digits that the makers' tables have."""
+    if isinstance(expected, dict):
+        assert list(actual) == list(expected), path
+        for key in expected:
+            assert_same(actual[key], expected[key], f"{path}/{key}")
+    elif expected and isinstance(expected, list) and isinstance(expected[0], dict):
+        assert len(actual) == len(expected), path
+        for i, pair in enumerate(zip(actual, expected, strict=True)):
+            assert_same(*pair, f"{path}/{i}")
+    else:
+        np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-9, err_msg=path)
+
+
+@pytest.fixture(scope="module")
+def recorded(data):
+    return json.loads((data / "g1_figures.json").read_text())
+
+
+def random_states(robot, count, *, height=(0.3, 1.2), tilt=np.inf, seed=0):
+    """``[count, 7 + J]`` joints within their limits, heights in m, and attitudes of every heading and at most ``tilt``."""
+    rng = np.random.default_rng(seed)
+    if tilt == np.inf:
+        turn = rng.normal(size=(count, 4))
+    else:
+        turn = np.concatenate([np.ones((count, 1)), np.tan(tilt / 2) * rng.uniform(-1, 1, (count, 3))], axis=1)
+    return np.concatenate(
+        [
+            rng.uniform(-1, 1, (count, 2)),
+            rng.uniform(*height, (count, 1)),
+            turn / np.linalg.norm(turn, axis=1, keepdims=True),
+            rng.uniform(robot.joint_low, robot.joint_high, (count, robot.joint_count)),
+        ],
+        axis=1,
+    )
+
+
+def mujoco_states(robot, states, model=None):
+    """MuJoCo's data at each state, one object reused."""
+    model = robot.model if model is None else model
+    data = mujoco.MjData(model)
+    for qpos in states:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        yield data
+
+
+# --- the model -------------------------------------------------------------------------------------------------------
+
+
+def test_model_has_the_recorded_masses_inertias_joints_and_poses(robot, recorded):
+    assert_same(figures(robot.model, [p["qpos"] for p in recorded["poses"]]), recorded)
+
+
+def test_makers_model_has_the_recorded_figures(external, recorded):
+    text = external("g1_29dof_rev_1_0.xml").read_text()
+    lines = [line for line in text.splitlines() if "mesh" not in line or "<compiler" in line]
+    maker = mujoco.MjModel.from_xml_string("\n".join(lines))
+    assert_same(figures(maker, [p["qpos"] for p in recorded["poses"]]), recorded)
+
+
+def test_robot_repeats_the_model(robot, recorded):
+    assert robot.joint_names == tuple(recorded["joints"])
+    joints = recorded["joints"].values()
+    np.testing.assert_allclose(np.stack([robot.joint_low, robot.joint_high], 1), [j["range"] for j in joints], rtol=1e-6)
+    np.testing.assert_array_equal(robot.joint_axis, [j["axis"] for j in joints])
+    np.testing.assert_array_equal(robot.effort, [j["effort"][1] for j in joints])
+    assert robot.total_mass == pytest.approx(33.341142, abs=1e-6)
+    names = list(recorded["bodies"])
+    parent = dict(zip(names, robot.body_parent, strict=True))
+    assert parent["pelvis"] == -1
+    assert names[parent["left_knee_link"]] == "left_hip_yaw_link"
+    assert names[parent["right_shoulder_pitch_link"]] == "torso_link"
+    for body, joint in zip(names, robot.body_joint, strict=True):
+        assert (body == "pelvis") if joint < 0 else recorded["joints"][robot.joint_names[joint]]["body"] == body
+    # The head has no joint and follows the torso, body 15 of the tree without the pelvis.
+    assert robot.jointless_row == 15 and robot.joint_names[14] == "waist_pitch_joint"
+    assert [names[b] for b in robot.key_body] == [
+        "left_ankle_roll_link",
+        "right_ankle_roll_link",
+        "torso_link",
+        "left_wrist_yaw_link",
+        "right_wrist_yaw_link",
+    ]
+    np.testing.assert_array_equal(robot.key_offset[2], [0.015, 0.0, 0.43])
+    assert not np.delete(robot.key_offset, 2, axis=0).any()
+    assert [robot.joint_names[j] for j in robot.sagittal_joints] == [
+        f"{side}_{joint}_joint" for side in ("left", "right") for joint in ("hip_pitch", "knee", "ankle_pitch")
+    ]
+
+
+def test_servo_gains_follow_from_the_motors(robot):
+    """Natural frequency 10 Hz, damping ratio 2: kp = I w^2 and kd = 2 * 2 I w with w = 2 pi 10."""
+    omega = 2 * np.pi * 10
+    model = robot.model
+    for i, name in enumerate(robot.joint_names):
+        (armature,) = (value for pattern, value in ARMATURE if re.search(pattern, name))
+        dof = 6 + i
+        assert model.dof_armature[dof] == pytest.approx(armature, rel=1e-7), name
+        assert robot.stiffness[i] == pytest.approx(armature * omega**2, rel=1e-6), name
+        assert robot.damping[i] == pytest.approx(4 * armature * omega, rel=1e-6), name
+        # The servo acts on its own joint: force = kp (target - q) - kd qd, limited to the motor's effort.
+        assert model.actuator_trnid[i, 0] == 1 + i
+        assert model.actuator_gear[i].tolist() == [1, 0, 0, 0, 0, 0]
+        np.testing.assert_array_equal(model.actuator_biasprm[i, :3], [0, -robot.stiffness[i], -robot.damping[i]])
+        np.testing.assert_array_equal(model.actuator_forcerange[i], [-robot.effort[i], robot.effort[i]])
+    assert (model.dof_frictionloss[6:] == 0.1).all() and not model.dof_frictionloss[:6].any()
+    assert not model.dof_damping.any() and not model.jnt_stiffness.any()
+    assert not model.actuator_ctrllimited.any()  # targets are not clipped to the joint range
+
+
+def test_physics_model_changes_a_copy(robot):
+    model = robot.physics_model(timestep=0.01, iterations=3, frictionloss=0.0)
+    assert (model.opt.timestep, model.opt.iterations) == (0.01, 3)
+    assert not model.dof_frictionloss.any()
+    assert robot.model.opt.timestep == 0.005 and robot.model.dof_frictionloss[6] == 0.1
+
+
+def test_only_the_feet_and_shins_touch_the_floor(robot):
+    model = robot.model
+    touching = {model.geom(i).name for i in np.flatnonzero(model.geom_contype)}
+    feet = {f"{s}_foot_{end}_{edge}" for s in ("left", "right") for end in ("heel", "toe") for edge in ("left", "right")}
+    assert touching == feet | {"left_shin", "right_shin"}
+    assert (model.geom_friction[[model.geom(name).id for name in touching | {"floor"}], 0] == 1.0).all()
+    fall = {model.body(b + 1).name for b in robot.fall_body}
+    assert not any(re.search("knee|ankle", name) for name in fall)
+    assert {"pelvis", "torso_link", "left_hip_yaw_link", "right_hip_yaw_link", "left_elbow_link"} <= fall
+    assert fall == {re.sub("left|right", lambda s: {"left": "right", "right": "left"}[s[0]], name) for name in fall}
+
+
+def test_default_pose_stands_on_its_soles(robot):
+    qpos = robot.default_qpos
+    assert ((robot.joint_low < qpos[7:]) & (qpos[7:] < robot.joint_high)).all()
+    poses = kinematics.body_poses(robot, jnp.asarray(qpos, jnp.float32))
+    # All eight sole spheres rest on the floor: hip, knee and ankle pitch add up to zero.
+    np.testing.assert_allclose(kinematics.sole_heights(robot, poses), np.zeros(8), atol=1e-6)
+    assert not kinematics.fallen(robot, poses)
+    assert 0.7 < qpos[2] < 0.8 and qpos[3:7].tolist() == [1, 0, 0, 0]
+
+
+def test_unknown_robot():
+    with pytest.raises(UserError, match="unknown robot 'atlas': expected one of unitree_g1"):
+        robots.load("atlas")
+
+
+# --- kinematics ------------------------------------------------------------------------------------------------------
+
+
+def test_body_poses_are_mujocos(robot):
+    states = random_states(robot, 48)
+    poses = kinematics.body_poses(robot, jnp.asarray(states, jnp.float32))
+    expected = [(d.xpos[1:].copy(), d.xquat[1:].copy()) for d in mujoco_states(robot, states)]
+    position, rotation = (np.array(x) for x in zip(*expected, strict=True))
+    assert poses.position.dtype == jnp.float32
+    np.testing.assert_allclose(poses.position, position, atol=1e-5)
+    sign = np.sign(np.sum(rotation * np.asarray(poses.rotation_wxyz), axis=-1, keepdims=True))
+    np.testing.assert_allclose(poses.rotation_wxyz, sign * rotation, atol=1e-5)
+    # Leading axes are free.
+    one = kinematics.body_poses(robot, jnp.asarray(states[:6], jnp.float32).reshape(2, 3, -1))
+    np.testing.assert_allclose(one.position[1, 2], poses.position[5], atol=1e-6)
+
+
+def test_body_poses_are_the_recorded_ones(robot, recorded):
+    qpos = jnp.asarray([p["qpos"] for p in recorded["poses"]], jnp.float32)
+    poses = kinematics.body_poses(robot, qpos)
+    np.testing.assert_allclose(poses.position, [p["position"] for p in recorded["poses"]], atol=1e-5)
+
+
+def test_key_points_are_in_their_bodies(robot):
+    states = random_states(robot, 8, seed=1)
+    points = kinematics.key_points(robot, kinematics.body_poses(robot, jnp.asarray(states, jnp.float32)))
+    for i, data in enumerate(mujoco_states(robot, states)):
+        torso = data.body("torso_link")
+        head = torso.xpos + torso.xmat.reshape(3, 3) @ [0.015, 0, 0.43]
+        np.testing.assert_allclose(points[i, 2], head, atol=1e-5)
+        np.testing.assert_allclose(points[i, 1], data.body("right_ankle_roll_link").xpos, atol=1e-5)
+        np.testing.assert_allclose(points[i, 3], data.body("left_wrist_yaw_link").xpos, atol=1e-5)
+
+
+def test_sole_heights_are_mujocos_distances(robot):
+    states = random_states(robot, 24, tilt=0.6, seed=2)
+    heights = kinematics.sole_heights(robot, kinematics.body_poses(robot, jnp.asarray(states, jnp.float32)))
+    model = robot.model
+    soles = [i for i in range(model.ngeom) if "_foot_" in model.geom(i).name]
+    floor = model.geom("floor").id
+    expected = [
+        [mujoco.mj_geomDistance(model, d, floor, g, 10.0, None) for g in soles] for d in mujoco_states(robot, states)
+    ]
+    np.testing.assert_allclose(heights, expected, atol=2e-5)
+    lowest = [robots.lowest_sole(robot, qpos) for qpos in states]
+    np.testing.assert_allclose(np.min(expected, axis=1), lowest, atol=1e-9)
+
+
+def test_fallen_is_mujocos_contact(robot):
+    """With the fall geoms made to collide, MuJoCo finds a floor contact exactly where `fallen` says so."""
+    model = robot.physics_model()
+    falls = [i for i in range(model.ngeom) if model.geom(i).name.endswith("_fall")]
+    assert len(falls) == len(robot.fall_body)
+    floor = model.geom("floor").id
+    model.geom_contype[:] = 0
+    model.geom_contype[falls] = 1
+    # Any attitude, and crouches and near falls, where limbs and trunk come close to the floor.
+    states = np.concatenate(
+        [random_states(robot, 150, height=(0.1, 0.9), seed=3), random_states(robot, 250, tilt=1.2, seed=4)]
+    )
+    contact, clearance = [], []
+    for data in mujoco_states(robot, states, model):
+        mujoco.mj_collision(model, data)
+        contact.append(any(floor in c.geom and c.dist < 0 for c in data.contact))
+        clearance.append(min(mujoco.mj_geomDistance(model, data, floor, g, 10.0, None) for g in falls))
+    contact, clearance = np.array(contact), np.array(clearance)
+    np.testing.assert_array_equal(contact, clearance < 0)
+    fallen = np.asarray(kinematics.fallen(robot, kinematics.body_poses(robot, jnp.asarray(states, jnp.float32))))
+    decided = np.abs(clearance) > 1e-5  # of float32
+    np.testing.assert_array_equal(fallen[decided], contact[decided])
+    assert decided.sum() > 390 and 50 < contact.sum() < 350
+    assert (np.abs(clearance) < 0.02).sum() > 10  # some are close calls
