@@ -1,6 +1,8 @@
-"""The command line: ``fmpjax train``, ``evaluate``, ``render``, ``config``."""
+"""The command line: ``fmpjax train``, ``evaluate``, ``render``, ``export``, ``config``."""
 
+import contextlib
 import dataclasses
+import io
 import sys
 import warnings
 from datetime import datetime
@@ -43,18 +45,18 @@ class Train:
     """Any other setting as section.field=value; see `fmpjax config`."""
 
     def __call__(self) -> None:
-        run = self._open()
-        from fmpjax import runs
-
-        if self.minutes is not None and self.minutes <= 0:
+        if self.minutes is not None and not self.minutes > 0:
             raise UserError(f"--minutes is {self.minutes:g}: expected more than 0")
+        run = self._open()
+        runs = _runs()
+
         finished = runs.train(run, resume=self.resume, minutes=self.minutes)
         if finished or run.checkpoints.latest(best=True) is not None:
             for path in runs.finish(run):
                 print(f"wrote {path}")
 
     def _open(self):
-        from fmpjax import runs
+        runs = _runs()
 
         changes = self._changes()
         if self.resume:
@@ -109,7 +111,7 @@ class Evaluate:
     """Take the newest checkpoint in place of the best."""
 
     def __call__(self) -> None:
-        from fmpjax import runs
+        runs = _runs()
         from fmpjax.evaluate import Evaluator, table
 
         if self.episodes is not None and self.episodes < 1:
@@ -136,7 +138,7 @@ class Render:
     """File, RUN/policy.mp4 by default; .gif where no encoder is installed."""
 
     def __call__(self) -> None:
-        from fmpjax import runs
+        runs = _runs()
         from fmpjax.evaluate import Evaluator
 
         run = runs.Run.open(self.run)
@@ -144,6 +146,22 @@ class Render:
         print("rolling out and rendering ...", flush=True)
         played = Evaluator(trainer, 8).play(state.ppo)
         print(f"wrote {runs.video(run, trainer, played, seconds=self.seconds, path=self.out)}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Copy a run's results, without its states, to a folder."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    out: tyro.conf.Positional[Path]
+    """Folder to write."""
+
+    def __call__(self) -> None:
+        runs = _runs()
+
+        for path in runs.export(runs.Run.open(self.run), self.out):
+            print(f"wrote {path}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,6 +176,13 @@ class ShowConfig:
             print(f"{key} = {value}")
 
 
+def _runs():
+    """`fmpjax.runs`, imported when a command needs it, without MJX's word on stdout that Warp is not installed."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        from fmpjax import runs
+    return runs
+
+
 def _default_preset() -> str:
     import jax
 
@@ -166,7 +191,7 @@ def _default_preset() -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: bad input is one sentence and exit code 2."""
-    commands = {"train": Train, "evaluate": Evaluate, "render": Render, "config": ShowConfig}
+    commands = {"train": Train, "evaluate": Evaluate, "render": Render, "export": Export, "config": ShowConfig}
     command = tyro.extras.subcommand_cli_from_dict(
         commands, prog="fmpjax", description="Flow-Matched Motion Priors in JAX.", args=arguments
     )

@@ -157,7 +157,7 @@ class Config:
 # - feature deviations floored at 0.05: coordinates that the demonstration hardly moves would carry the distance;
 # - Adam with a rate that follows the KL divergence, small networks, learned deviation: sample efficiency.
 _LAPTOP: dict[str, Any] = {
-    "transitions": 7_700_000,
+    "transitions": 12_000_000,
     "evaluations": (0.25, 0.5, 0.75, 1.0),
     "evaluation_episodes": 256,
     "chunk": 25,
@@ -210,7 +210,7 @@ _SMOKE: dict[str, Any] = _LAPTOP | {
 PRESETS: Mapping[str, Mapping[str, Any]] = {"smoke": _SMOKE, "laptop": _LAPTOP, "paper": {}}
 
 
-def preset(name: str, **changes: Any) -> Config:
+def preset(name: str, /, **changes: Any) -> Config:
     """A preset's configuration with changes, given as ``section.field`` keys.
 
     Raises:
@@ -305,6 +305,8 @@ def validate(config: Config) -> Config:
     for key in ("ppo.discount", "ppo.gae_lambda", "prior.query_share"):
         if not 0 < flat[key] <= 1:
             raise UserError(f"setting {key} is {flat[key]}: expected a number in (0, 1]")
+    if not 0 <= config.seed < 2**32:
+        raise UserError(f"setting seed is {config.seed}: expected 0 to {2**32 - 1}")
     if not 2 <= config.features.history <= 64:
         raise UserError(f"setting features.history is {config.features.history}: expected 2 to 64 frames")
     if config.prior.query_is_bank and config.prior.minibatch != config.prior.bank:

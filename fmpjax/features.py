@@ -104,7 +104,8 @@ def prior_window(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """The prior's window before normalisation, ``[..., H * 239]`` for 29 joints, oldest frame first.
 
     A frame is root position (m; x and y relative to the newest frame, z absolute), root rotation 6D, joint rotations
-    6D, key points less that frame's root (m), root velocity (m/s), root angular velocity (rad/s), joint velocities (rad/s).
+    6D, key points less that frame's root (m), root velocity (m/s), root angular velocity (rad/s), joint velocities
+    (rad/s).
 
     Args:
       qpos: ``[..., H, 7 + J]`` states, oldest first.

@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -152,7 +153,8 @@ def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> bo
             _check_finite(run, state, config)
             out_of_time = minutes is not None and time.monotonic() - began + 1.5 * took > minutes * 60
             stopping = out_of_time or stop.requested
-            if any(done >= m > done - config.chunk for m in milestones) and not stop.requested:
+            at_milestone = any(done >= m > done - config.chunk for m in milestones)
+            if (at_milestone or out_of_time) and not stop.requested:
                 evaluation = evaluator(state.ppo)
                 metrics |= {f"eval/{name}": float(value) for name, value in evaluation.as_dict().items()}
                 progress.note(f"evaluation at {transitions:,} transitions, {clock(training_seconds)} of training:")
@@ -181,19 +183,41 @@ def finish(run: Run) -> list[Path]:
     run.save_evaluation(evaluation)
     transitions = int(state.iteration) * trainer.config.transitions_per_iteration
     print(f"best policy, {transitions:,} transitions:\n{table(evaluation)}")
-    paths = [run.folder / "evaluation.json"]
+    frames = _stride_frames(trainer, played)
+    render.contact_sheet(run.folder / "frames.png", frames, columns=6)
+    paths = [run.folder / "evaluation.json", run.folder / "frames.png"]
     if (run.folder / "metrics.csv").exists():
         curves.learning_curves(run.folder / "metrics.csv", run.folder / "curves.png")
         paths.append(run.folder / "curves.png")
     return [*paths, video(run, trainer, played)]
 
 
+_EXPORTED = (
+    "config.json provenance.json metrics.csv evaluation.json ranking-start.json ranking.json curves.png frames.png "
+    "policy.mp4 policy.gif"
+).split()
+
+
+def export(run: Run, out: Path) -> list[Path]:
+    """Copy what a run has to show, without its states and its demonstration, into ``out``; the paths written.
+
+    Raises:
+      UserError: ``out`` holds another run's results, or cannot be written.
+    """
+    if (out / "config.json").exists() and (out / "config.json").read_text() != (run.folder / "config.json").read_text():
+        raise UserError(f"{out} holds results of another configuration: expected a new folder or this run's own")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        return [Path(shutil.copy2(run.folder / n, out / n)) for n in _EXPORTED if (run.folder / n).exists()]
+    except OSError as error:
+        raise UserError(f"folder {out} cannot be written: {error.strerror}") from None
+
+
 def video(run: Run, trainer: Trainer, played, *, seconds: float = 10.0, path: Path | None = None) -> Path:
     """The policy beside the demonstration, as a video; the path written."""
     rate = trainer.config.control_rate
     stride = 2  # 25 pictures a second
-    # The longest episode shows most; ties go to the first.
-    episode = int(np.argmax(played.length))
+    episode = _longest(played)
     steps = slice(0, min(int(seconds * rate), int(played.length[episode])), stride)
     frames = render.side_by_side(
         trainer.robot,
@@ -202,6 +226,20 @@ def video(run: Run, trainer: Trainer, played, *, seconds: float = 10.0, path: Pa
         labels=("policy", "demonstration"),
     )
     return render.write_video(path or run.folder / "policy.mp4", frames, fps=rate / stride)
+
+
+def _longest(played) -> int:
+    """The longest episode, which shows most; ties go to the first."""
+    return int(np.argmax(played.length))
+
+
+def _stride_frames(trainer: Trainer, played) -> np.ndarray:
+    """Twelve pictures of one second of the policy, from the late part of its longest episode."""
+    episode = _longest(played)
+    length = int(played.length[episode])
+    last = min(length - 1, int(0.7 * len(played.qpos)))
+    rows = np.linspace(max(0, last - int(trainer.config.control_rate)), last, 12).astype(int)
+    return render.render_frames(trainer.robot, played.qpos[rows, episode], width=320, height=320)
 
 
 def provenance() -> dict[str, object]:

@@ -1,8 +1,8 @@
 """How the fitted reward ranks the demonstration against spoiled copies of itself.
 
 The prior is fitted to the windows of a fixed policy (an untrained one, or a run's) and then scores the demonstration
-and copies that are frozen, slowed, reversed, shuffled in time, and noisy. A reward is of use where the copies lose. Run as
-``python -m fmpjax.experiments.ranking --run RUN`` or, for the start of training, with ``--start``.
+and copies that are frozen, slowed, reversed, shuffled in time, and noisy. A reward is of use where the copies lose. Run
+as ``python -m fmpjax.experiments.ranking --run RUN`` or, for the start of training, with ``--start``.
 """
 
 import dataclasses
@@ -125,7 +125,7 @@ def main(run: Path, start: bool = False, last: bool = False, updates: int = 512,
       start: take the untrained policy.
       last: take the newest checkpoint in place of the best.
       updates: reward-model updates of the fit.
-      out: JSON file to write, RUN/ranking.json by default.
+      out: JSON file to write, RUN/ranking.json or RUN/ranking-start.json by default.
     """
     from fmpjax import runs
 
@@ -140,7 +140,7 @@ def main(run: Path, start: bool = False, last: bool = False, updates: int = 512,
     ranking = rank(trainer, windows, jax.random.PRNGKey(1), updates)
     print(f"pool: {windows.shape[0] * windows.shape[1]} windows, mean forward speed {speed:.3f} m/s")
     print(table(ranking))
-    path = out or opened.folder / "ranking.json"
+    path = out or opened.folder / ("ranking-start.json" if start else "ranking.json")
     partial = path.with_name(path.name + ".partial")
     partial.write_text(json.dumps({"pool_speed": speed, "updates": updates, "windows": ranking}, indent=1) + "\n")
     os.replace(partial, path)
