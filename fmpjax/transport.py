@@ -111,9 +111,9 @@ def extension(cost: jax.Array, dual: jax.Array, epsilon: jax.Array) -> tuple[jax
     return epsilon * jax.nn.logsumexp(logits, axis=-1), jax.nn.softmax(logits, axis=-1)
 
 
-def gradient(probability: jax.Array, targets: jax.Array, x: jax.Array) -> jax.Array:
-    """Gradient of a dual extension, sum_j p_j y_j - x, ``[q, d]``."""
-    return jnp.matmul(probability, targets, precision=_HIGHEST) - x
+def barycentre(probability: jax.Array, targets: jax.Array) -> jax.Array:
+    """Mean target sum_j p_j y_j, ``[q, d]``; less x it is the gradient of a dual extension at x."""
+    return jnp.matmul(probability, targets, precision=_HIGHEST)
 
 
 class ScoreFunction(NamedTuple):
@@ -143,12 +143,12 @@ class ScoreFunction(NamedTuple):
     def gradient(self, x: jax.Array) -> jax.Array:
         """Gradient of S_B at ``x [q, d]``."""
         (_, to_expert), (_, to_source) = self._extensions(x)
-        return gradient(to_expert, self.expert_bank, x) - gradient(to_source, self.source_bank, x)
+        return barycentre(to_expert, self.expert_bank) - barycentre(to_source, self.source_bank)
 
     def expert_extension(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
         """A_E(x) ``[q]`` up to a constant, and its gradient ``[q, d]``."""
         (value, probability), _ = self._extensions(x)
-        return value, gradient(probability, self.expert_bank, x)
+        return value, barycentre(probability, self.expert_bank) - x
 
     def match_probability(self, x: jax.Array) -> jax.Array:
         """Probability of matching each expert atom, ``[q, m]``."""

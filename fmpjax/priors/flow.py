@@ -62,7 +62,7 @@ def teach(
     return Teacher(
         score=expert_value - source_value,
         # The -x of the two gradients cancels.
-        gradient=to_expert @ expert - to_source @ source,
+        gradient=transport.barycentre(to_expert, expert) - transport.barycentre(to_source, source),
         to_expert=to_expert,
         to_source=to_source,
         solution=solution,

@@ -1,0 +1,165 @@
+"""What does one reward update cost, against the floor of its matrix products?
+
+Full size: 256 queries distinct from the source bank, banks of 256, windows of ten 239-number frames (1,170 compact
+coordinates), three losses. Windows are the bundled walk's with noise. The update is timed as the slope between two
+scans of different lengths, so that scoring and dispatch fall out; its parts are timed one by one on the same data. The
+floor is the update's matrix products, counted by formula, at the machine's own rate for them, measured in the same run.
+"""
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from fmpjax import config, motion, potential, priors, transport
+from fmpjax.config import PriorConfig
+from fmpjax.priors import flow
+from fmpjax.train import Trainer
+
+TARGET = 50.0  # ms an update
+REPORTED_UPDATES = 9216  # of the paper's offline comparison
+FEW, MANY = 4, 20  # updates of the two scans
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """Time of a call, until its arrays are there."""
+    began = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - began
+
+
+def product_flops(settings: PriorConfig, size: int) -> dict[str, float]:
+    """Floating-point operations of an update's matrix products, for windows of ``size`` coordinates."""
+    bank, query = settings.bank, settings.minibatch
+    points = query * (2 if settings.flow_weight else 1)
+    # A layer's product and its transpose for the gradient in x; then the adjoints of both: two each, but that the
+    # points themselves need none.
+    layers = [(size, settings.hidden[0], 5), (size, potential.HEADS, 4)]
+    layers += [(i, o, 6) for i, o in zip(settings.hidden, (*settings.hidden[1:], potential.HEADS), strict=True)]
+    scored = sum(2 * query * i * o for i, o, _ in layers)
+    return {
+        "costs": 2.0 * size * (bank * bank * 2 + query * bank * 2),
+        "teacher gradient": 2.0 * size * query * bank * 2,
+        "network": sum(2.0 * points * i * o * times for i, o, times in layers),
+        "correlation metric": float(scored),
+    }
+
+
+def parts(settings: PriorConfig, dimension, source, query, expert, params) -> dict[str, Callable[[], object]]:
+    """The update's parts as compiled calls on one source bank and its queries."""
+    costs = jax.jit(
+        lambda s, q, e: (
+            transport.squared_cost(s, e),
+            transport.squared_cost(s, s),
+            transport.squared_cost(q, e),
+            transport.squared_cost(q, s),
+        )
+    )
+    cross, itself, to_expert, to_source = costs(source, query, expert)
+    entropy = jax.jit(lambda c: transport.entropy_coefficient(c, dimension, settings.epsilon_fraction))
+    epsilon = entropy(cross)
+    limits = {"threshold": settings.sinkhorn_threshold, "max_iterations": settings.sinkhorn_iterations}
+    solve = jax.jit(lambda c, i, e: transport.solve(c, i, e, **limits))
+    solution = solve(cross, itself, epsilon)
+
+    @jax.jit
+    def extend(to_expert, to_source, solution):
+        value, p = transport.extension(to_expert, solution.expert_dual, solution.epsilon)
+        own, own_p = transport.extension(to_source, solution.self_dual, solution.epsilon)
+        return flow.Teacher(value - own, p @ expert - own_p @ source, p, own_p, solution)
+
+    teacher = extend(to_expert, to_source, solution)
+    sample = jax.jit(lambda key: flow.sample_flow(key, query, teacher, source, expert))
+    points = sample(jax.random.PRNGKey(0))
+    network = jax.jit(
+        lambda p: jax.value_and_grad(flow.losses, has_aux=True)(p, query, teacher, points, dimension, settings)
+    )
+    optimizer = optax.chain(optax.clip_by_global_norm(settings.clip_norm), optax.adam(settings.learning_rate))
+    adam, gradients = optimizer.init(params), network(params)[1]
+    step = jax.jit(lambda g, a, p: optimizer.update(g, a, p))
+    correlate = jax.jit(lambda p: potential.score(p, query, dimension))
+    return {
+        "costs": lambda: costs(source, query, expert),
+        "median": lambda: entropy(cross),
+        "Sinkhorn": lambda: solve(cross, itself, epsilon),
+        "extensions, teacher": lambda: extend(to_expert, to_source, solution),
+        "flow samples": lambda: sample(jax.random.PRNGKey(0)),
+        "losses and gradient": lambda: network(params),
+        "Adam": lambda: step(gradients, adam, params),
+        "correlation metric": lambda: correlate(params),
+    }
+
+
+def matmul_rate(rounds: int, points: int, size: int, width: int) -> Callable[[], float]:
+    """Measures the machine's rate (FLOP/s) for products of the network's first layer's shape."""
+    a, b = jnp.ones((points, size)), jnp.ones((size, width))
+    chain = jax.jit(lambda a, b: jax.lax.fori_loop(0, rounds, lambda _, a: (a @ b) @ b.T * 1e-6, a))
+    jax.block_until_ready(chain(a, b))
+    return lambda: 4.0 * rounds * points * size * width / seconds(lambda: chain(a, b))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--noise", type=float, default=0.5, help="noise of the windows, standard deviations")
+    parser.add_argument("--environments", type=int, default=64, help="the pool is 32 windows of each")
+    arguments = parser.parse_args()
+
+    settings = config.preset("paper")
+    clip = motion.load(settings.motion, rate=settings.control_rate)
+    trainer = Trainer(settings, clip)
+    windows, fitted = trainer.expert_features, settings.prior
+    dimension, size = trainer.feature_map.dimension, windows.shape[-1]
+    pick_key, noise_key, prior_key, key = jax.random.split(jax.random.PRNGKey(0), 4)
+    shape = (settings.ppo.rollout_steps, arguments.environments)
+    picked = windows[jax.random.randint(pick_key, shape, 0, len(windows))]
+    weight = jnp.tile(trainer.feature_map.weight, settings.features.history)
+    features = picked + arguments.noise * weight * jax.random.normal(noise_key, picked.shape)
+    expert = windows[jnp.arange(fitted.bank) * len(windows) // fitted.bank]
+    rollout = priors.Rollout(features, jnp.ones(shape, bool))
+
+    def scan(updates: int):
+        prior = priors.make("fmp", expert, float(dimension), dataclasses.replace(fitted, updates=updates))
+        update, state = jax.jit(prior.update), prior.init(prior_key)
+        return lambda: update(state, rollout, key)
+
+    few, many = scan(FEW), scan(MANY)
+    pool = features.reshape(-1, size)
+    warm = many()
+    pieces = parts(fitted, dimension, pool[: fitted.bank], pool[-fitted.minibatch :], expert, warm[0].params)
+    rate = matmul_rate(8, 2 * fitted.minibatch, size, fitted.hidden[0])
+    for call in (few, many, *pieces.values()):
+        seconds(call)
+    slopes, rates, taken = [], [], []
+    for _ in range(arguments.rounds):
+        slopes.append(1e3 * (seconds(many) - seconds(few)) / (MANY - FEW))
+        rates.append(rate())
+        taken.append([1e3 * seconds(call) for call in pieces.values()])
+    update, rate, taken = float(np.median(slopes)), float(np.median(rates)), np.median(taken, axis=0)
+
+    flops = product_flops(fitted, size)
+    floor = 1e3 * sum(flops.values()) / rate
+    print(
+        f"{fitted.minibatch} queries, banks of {fitted.bank}, d = {float(dimension):.0f} ({size} compact), Sinkhorn "
+        f"{float(warm[2]['sinkhorn_iterations']):.0f} iterations, {float(warm[2]['unconverged']):.0f} not converged"
+    )
+    print(f"{'part':<24}{'ms':>8}{'share':>8}")
+    for name, ms in zip(pieces, taken, strict=True):
+        print(f"{name:<24}{ms:>8.2f}{100 * ms / taken.sum():>7.0f}%")
+    print(f"{'sum of the parts':<24}{taken.sum():>8.2f}")
+    print(f"{'update, in the scan':<24}{update:>8.2f}   target {TARGET:.0f}: {'met' if update <= TARGET else 'missed'}")
+    products = ", ".join(f"{name} {count / 1e9:.2f}" for name, count in flops.items())
+    print(
+        f"{'floor':<24}{floor:>8.2f}   {sum(flops.values()) / 1e9:.2f} GFLOP ({products}) at {rate / 1e9:.0f} GFLOP/s"
+    )
+    print(f"{'update over floor':<24}{update / floor:>8.2f}")
+    print(f"{REPORTED_UPDATES:,} updates: {REPORTED_UPDATES * update / 1e3:,.0f} s")
+
+
+if __name__ == "__main__":
+    main()

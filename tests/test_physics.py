@@ -1,0 +1,204 @@
+"""The backends against MuJoCo's own step loop and against each other, and the servos against what they promise."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from fmpjax import physics
+from fmpjax.config import PhysicsConfig, preset
+from fmpjax.errors import UserError
+from fmpjax.physics import native
+
+PAPER = PhysicsConfig(backend="native")
+LAPTOP = dataclasses.replace(preset("laptop").physics, backend="native")
+
+
+@pytest.fixture(scope="module")
+def states(robot, walk):
+    """Twelve states - standing, in the air, walking - and joint targets near them."""
+    rng = np.random.default_rng(0)
+    rows = np.linspace(10, len(walk) - 1, 8).astype(int)
+    standing = np.stack([robot.default_qpos] * 4)
+    standing[2:, 2] += 0.5
+    walking = walk.qpos[rows].copy()
+    # The clip's soles graze the floor, where rounding decides whether there is a contact: press them a little into it.
+    walking[:, 2] -= 0.002
+    qpos = np.concatenate([standing, walking])
+    qvel = np.concatenate([np.zeros((4, walk.qvel.shape[1])), walk.qvel[rows]])
+    qvel[2:4] = 0.5 * rng.normal(size=(2, qvel.shape[1]))
+    targets = qpos[:, 7:] + 0.1 * rng.normal(size=(12, robot.joint_count))
+    return (*(x.astype(np.float32) for x in (qpos, qvel)), targets.astype(np.float32))
+
+
+def advance(backend, qpos, qvel, targets, steps):
+    """States after each of some control steps with held targets, ``[steps, N, ...]``."""
+
+    def one(state, _):
+        state = backend.step(state, jnp.asarray(targets))
+        return state, state
+
+    start = physics.reset(jnp.asarray(qpos), jnp.asarray(qvel))
+    _, course = jax.jit(lambda s: jax.lax.scan(one, s, None, length=steps))(start)
+    return jax.tree.map(np.asarray, course)
+
+
+# --- native against MuJoCo -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("config", [PAPER, LAPTOP], ids=["200 Hz", "100 Hz"])
+def test_native_equals_the_plain_step_loop(robot, states, config):
+    qpos, qvel, targets = states
+    backend = physics.make(robot, config)
+    course = advance(backend, qpos, qvel, targets, 3)
+    model = native.model(robot, config)
+    assert model.opt.timestep == config.timestep and model.opt.iterations == config.iterations
+    assert (model.dof_frictionloss[6:] == config.frictionloss).all()
+    data = mujoco.MjData(model)
+    for i in range(len(qpos)):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[i], qvel[i], targets[i]
+        # The state is handed on as float32 after each control step.
+        for step in range(3):
+            for _ in range(config.substeps):
+                before = data.qvel.copy()
+                mujoco.mj_step(model, data)
+            np.testing.assert_allclose(course.qpos[step, i], data.qpos, atol=1e-6)
+            np.testing.assert_allclose(course.qvel[step, i], data.qvel, rtol=1e-6, atol=1e-6)
+            acceleration = (data.qvel - before) / config.timestep
+            np.testing.assert_allclose(course.warmstart[step, i], acceleration, rtol=1e-4, atol=1e-2)
+            data.qpos[:], data.qvel[:] = course.qpos[step, i], course.qvel[step, i]
+            data.qacc_warmstart[:] = course.warmstart[step, i]
+
+
+def test_native_does_not_depend_on_threads_or_order(robot, states):
+    qpos, qvel, targets = (np.concatenate([x, x[::-1], x]) for x in states)
+    one = advance(physics.make(robot, dataclasses.replace(LAPTOP, threads=1)), qpos, qvel, targets, 10)
+    three = physics.make(robot, dataclasses.replace(LAPTOP, threads=3))
+    order = np.random.default_rng(0).permutation(len(qpos))
+    for indices in (np.arange(len(qpos)), order, order[:5]):
+        many = advance(three, qpos[indices], qvel[indices], targets[indices], 10)
+        for a, b in zip(one, many, strict=True):
+            np.testing.assert_array_equal(a[:, indices], b)
+
+
+def test_a_state_that_is_not_finite_shows_and_stays_alone(robot, states):
+    qpos, qvel, targets = states
+    backend = physics.make(robot, LAPTOP)
+    good = advance(backend, qpos, qvel, targets, 2)
+    bad = qvel.copy()
+    bad[1, 8], bad[5, 0] = np.nan, 1e30
+    with np.errstate(all="ignore"):
+        struck = advance(backend, qpos, bad, targets, 2)
+    others = np.array([i not in (1, 5) for i in range(len(qpos))])
+    for a, b in zip(good, struck, strict=True):
+        np.testing.assert_array_equal(a[:, others], b[:, others])
+    for i in (1, 5):
+        velocity = struck.qvel[0, i]
+        assert not np.isfinite(velocity).all() or np.abs(velocity).max() > 1e3
+
+
+# --- servos ----------------------------------------------------------------------------------------------------------
+
+
+def test_servos_hold_their_force_limits(robot):
+    model = native.model(robot, PAPER)
+    data = mujoco.MjData(model)
+    for sign in (-1.0, 1.0):
+        data.qpos[:] = robot.default_qpos
+        data.qpos[2], data.qvel[:] = 10.0, 0.0
+        data.ctrl[:] = sign * 1e3
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(data.actuator_force, sign * robot.effort, rtol=1e-9)
+        np.testing.assert_allclose(data.qfrc_actuator[6:], sign * robot.effort, rtol=1e-9)
+    assert robot.effort.min() > 0 and robot.effort.max() < 200
+
+
+def test_servos_are_springs_with_damping(robot):
+    """Force = kp (target - angle) - kd velocity, kp = armature (2 pi 10)^2 and kd = 4 armature 2 pi 10."""
+    model = native.model(robot, PAPER)
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.default_qpos
+    rng = np.random.default_rng(0)
+    data.qvel[6:] = 0.05 * rng.normal(size=robot.joint_count)
+    data.ctrl[:] = robot.default_qpos[7:] + 0.02 * rng.normal(size=robot.joint_count)
+    mujoco.mj_forward(model, data)
+    kp, kd = model.dof_armature[6:] * (2 * np.pi * 10) ** 2, 4 * model.dof_armature[6:] * 2 * np.pi * 10
+    expected = kp * (data.ctrl - data.qpos[7:]) - kd * data.qvel[6:]
+    np.testing.assert_allclose(data.actuator_force, expected, rtol=1e-5)
+
+
+def test_servos_reach_their_targets(robot):
+    """In free fall, where nothing pulls at the joints, every joint comes to its target within a second."""
+    rng = np.random.default_rng(0)
+    qpos = robot.default_qpos[None].repeat(4, 0)
+    qpos[:, 2] = 20.0
+    targets = np.clip(qpos[:, 7:] + 0.2 * rng.uniform(-1, 1, (4, robot.joint_count)), robot.joint_low, robot.joint_high)
+    course = advance(
+        physics.make(robot, PAPER), qpos.astype(np.float32), np.zeros((4, 35), np.float32), targets.astype(np.float32), 50
+    )
+    error = np.abs(course.qpos[-1, :, 7:] - targets)
+    print(f"servos after 1 s: worst error {error.max():.4f} rad")
+    assert error.max() < 0.02
+    # Half way the hinges are on their way, not there at once: a servo has a force limit.
+    assert np.abs(course.qpos[0, :, 7:] - targets).max() > 0.05
+
+
+# --- rates -----------------------------------------------------------------------------------------------------------
+
+
+def test_laptop_rate_holds_the_standing_robot_like_the_paper_rate(robot):
+    """Ten control steps of standing at 100 Hz end where 200 Hz ends them: root within 2 mm, joints within 0.02 rad."""
+    qpos = robot.default_qpos[None].astype(np.float32)
+    courses = [
+        advance(physics.make(robot, c), qpos, np.zeros((1, 35), np.float32), qpos[:, 7:], 10) for c in (PAPER, LAPTOP)
+    ]
+    gap = np.abs(courses[0].qpos - courses[1].qpos)
+    print(f"100 Hz against 200 Hz: root {gap[..., :3].max() * 1e3:.2f} mm, joints {gap[..., 7:].max():.4f} rad")
+    assert gap[..., :3].max() < 2e-3 and gap[..., 7:].max() < 0.02
+    for course in courses:
+        # The legs carry it: without servos the pelvis would be 20 cm lower by now.
+        assert np.abs(course.qpos[..., 2] - qpos[0, 2]).max() < 0.01
+
+
+def test_laptop_rate_walks_like_the_paper_rate(robot, states):
+    """From walking states with held targets, three control steps differ by less than 1 cm and 0.05 rad."""
+    qpos, qvel, _ = (x[4:] for x in states)
+    courses = [advance(physics.make(robot, c), qpos, qvel, qpos[:, 7:], 3) for c in (PAPER, LAPTOP)]
+    gap = np.abs(courses[0].qpos - courses[1].qpos)
+    print(f"100 Hz against 200 Hz, walking: root {gap[..., :3].max() * 1e3:.2f} mm, joints {gap[..., 7:].max():.4f} rad")
+    assert gap[..., :3].max() < 0.01 and gap[..., 7:].max() < 0.05
+
+
+# --- MJX -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_mjx_steps_like_native(robot, states):
+    """Both backends from the same standing, flying and walking states, three control steps with the same targets."""
+    pick = np.array([0, 1, 2, 3, 4, 6, 9, 11])
+    qpos, qvel, targets = (x[pick] for x in states)
+    config = dataclasses.replace(LAPTOP, iterations=10, ls_iterations=20)
+    ours = advance(physics.make(robot, config), qpos, qvel, targets, 3)
+    theirs = advance(physics.make(robot, dataclasses.replace(config, backend="mjx", impl="jax")), qpos, qvel, targets, 3)
+    gaps = {}
+    for name, rows in (("standing", slice(0, 2)), ("in the air", slice(2, 4)), ("walking", slice(4, None))):
+        gap = gaps[name] = [np.abs(a - b)[:, rows].max(axis=(1, 2)) for a, b in zip(ours[:2], theirs[:2], strict=True)]
+        shown = ["[" + " ".join(f"{v:.1e}" for v in g) + "]" for g in gap]
+        print(f"native and MJX, {name}: qpos {shown[0]} m or rad, qvel {shown[1]} m/s or rad/s after each step")
+    for name, (position, velocity) in gaps.items():
+        assert position.max() < 1e-4 and velocity.max() < 1e-2, name
+
+
+@pytest.mark.skipif(jax.default_backend() == "gpu", reason="an NVIDIA device may have Warp")
+def test_warp_without_its_device_is_refused(robot):
+    with pytest.raises(UserError, match="'warp': expected an NVIDIA device, found cpu"):
+        physics.make(robot, dataclasses.replace(PAPER, backend="mjx", impl="warp"))
+
+
+def test_auto_is_native_on_a_cpu(robot):
+    expected = "native" if jax.default_backend() == "cpu" else "mjx"
+    assert physics.make(robot, PhysicsConfig()).name == expected

@@ -1,0 +1,398 @@
+"""A run from its first iteration to its last, interrupted and resumed in every way that must not matter."""
+
+import csv
+import json
+import logging
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fmpjax
+from fmpjax import cli, config, runs
+from fmpjax.checkpoint import Checkpoints
+from fmpjax.config import preset
+from fmpjax.errors import UserError
+from fmpjax.evaluate import Episodes, Evaluator
+from fmpjax.train import Trainer, expert_bank_rows
+
+# Eight environments, eight steps, five chunks of two iterations: a second of training after the compilation.
+TINY = {
+    "transitions": 8 * 8 * 10,
+    "chunk": 2,
+    "evaluations": (0.4, 1.0),
+    "evaluation_episodes": 4,
+    "env.count": 8,
+    "env.first_cap": 20,
+    "env.episode_steps": 60,
+    "prior.bank": 16,
+    "prior.minibatch": 16,
+    "prior.hidden": (16, 16),
+    "ppo.rollout_steps": 8,
+    "ppo.hidden": (16,),
+    "ppo.critic_epochs": 2,
+    "ppo.actor_epochs": 2,
+}
+ROOT = str(Path(fmpjax.__file__).parents[1])
+
+
+def tiny(**changes):
+    return preset("smoke", **(TINY | changes))
+
+
+def command(*arguments):
+    return [sys.executable, "-m", "fmpjax.cli", *map(str, arguments)]
+
+
+def settings(values):
+    """The command line's form of settings."""
+    text = {k: ",".join(map(str, v)) if isinstance(v, tuple) else v for k, v in values.items()}
+    return [word for key, value in text.items() for word in ("--set", f"{key}={value}")]
+
+
+def rows(run):
+    with (run / "metrics.csv").open(newline="") as file:
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+
+
+def leaves(run, *, best=False):
+    """A run's newest checkpoint, leaf by leaf."""
+    trainer = runs.Run.open(run).trainer()
+    state = Checkpoints(run).restore(trainer.init(), best=best)
+    return {jax.tree_util.keystr(path): np.asarray(x) for path, x in jax.tree_util.tree_flatten_with_path(state)[0]}
+
+
+@pytest.fixture(scope="module")
+def compiled_programs():
+    """Names of the programs that XLA compiles while the module's run trains."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, compiled_programs):
+    """A run trained from start to end in this process."""
+    folder = tmp_path_factory.mktemp("train") / "whole"
+    run = runs.Run.create(folder, tiny())
+
+    class Listener(logging.Handler):
+        def emit(self, record):
+            message = record.getMessage()
+            if message.startswith("Compiling "):
+                compiled_programs.append(message.split()[1])
+
+    listener, log = Listener(), logging.getLogger("jax._src.interpreters.pxla")
+    log.addHandler(listener)
+    try:
+        with jax.log_compiles():
+            assert runs.train(run)
+    finally:
+        log.removeHandler(listener)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """The same run, stopped by its time budget after the first chunk."""
+    folder = tmp_path_factory.mktemp("train") / "halved"
+    run = runs.Run.create(folder, tiny())
+    assert not runs.train(run, minutes=1e-6)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trainer(trained):
+    return runs.Run.open(trained).trainer()
+
+
+# --- the course of a run ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_program_is_compiled_exactly_once(trained, compiled_programs):
+    """Five chunks and two evaluations: one compilation of the chunk, one of the evaluation's rollout."""
+    chunks = [name for name in compiled_programs if "chunk" in name]
+    plays = [name for name in compiled_programs if "_play" in name]
+    assert len(chunks) == 1 and len(plays) == 1, compiled_programs
+
+
+@pytest.mark.slow
+def test_metrics_have_a_row_a_chunk(trained):
+    found = rows(trained)
+    assert [int(r["iteration"]) for r in found] == [2, 4, 6, 8, 10]
+    assert [int(r["transitions"]) for r in found] == [128, 256, 384, 512, 640]
+    # Evaluations at 40 and 100 per cent of the budget, and nowhere else.
+    assert [bool(r["eval/quality"]) for r in found] == [False, True, False, False, True]
+    for row in found:
+        assert np.isfinite(float(row["train/reward"])) and float(row["train/nonfinite"]) == 0
+        assert 0 < float(row["train/reward"]) < 2
+
+
+@pytest.mark.slow
+def test_last_three_checkpoints_and_the_best_one_are_kept(trained):
+    assert Checkpoints(trained).latest() == 10
+    # A run saves at evaluations and at its end: after 4 and 10 iterations.
+    assert sorted(p.name for p in (trained / "checkpoints").iterdir() if p.name.isdigit()) == ["10", "4"]
+    best = [int(p.name) for p in (trained / "best").iterdir() if p.name.isdigit()]
+    quality = {int(r["iteration"]): float(r["eval/quality"]) for r in rows(trained) if r["eval/quality"]}
+    # Ties go to the later one.
+    assert best == [max(i for i, q in quality.items() if q == max(quality.values()))]
+
+
+@pytest.mark.slow
+def test_save_keeps_three_and_only_one_best(trainer, tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    state = trainer.init()
+    for i in (1, 2, 3, 4, 5):
+        checkpoints.save(state._replace(iteration=jnp.int32(i)))
+        checkpoints.save(state._replace(iteration=jnp.int32(i)), best=True)
+    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir() if p.name.isdigit()) == ["3", "4", "5"]
+    assert [p.name for p in (tmp_path / "best").iterdir() if p.name.isdigit()] == ["5"]
+    restored = checkpoints.restore(state)
+    assert int(restored.iteration) == 5
+    for a, b in zip(jax.tree.leaves(state._replace(iteration=5)), jax.tree.leaves(restored), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.slow
+def test_a_spent_budget_trains_no_further(trained):
+    before = rows(trained)
+    assert runs.train(runs.Run.open(trained), resume=True)
+    assert rows(trained) == before and Checkpoints(trained).latest() == 10
+
+
+@pytest.mark.slow
+def test_finish_writes_evaluation_curves_and_video(trained):
+    paths = runs.finish(runs.Run.open(trained))
+    assert all(p.is_file() and p.stat().st_size > 0 for p in paths)
+    assert {"evaluation.json", "curves.png"} <= {p.name for p in paths}
+    evaluation = json.loads((trained / "evaluation.json").read_text())
+    assert evaluation["episodes"] == 4 and 0 <= evaluation["falls"] <= 4 and 0 < evaluation["mean_length"] <= 60
+    # The best checkpoint's figures are those that training logged when it chose it.
+    iteration = Checkpoints(trained).latest(best=True)
+    logged = next(r for r in rows(trained) if int(r["iteration"]) == iteration)
+    np.testing.assert_allclose(evaluation["mean_length"], float(logged["eval/mean_length"]), rtol=1e-4)
+    np.testing.assert_allclose(evaluation["sinkhorn"], float(logged["eval/sinkhorn"]), rtol=1e-4)
+
+
+# --- interruptions ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_resume_in_a_new_process_is_exact(trained, stopped):
+    """Two iterations, a checkpoint, and eight more in another process are ten in one, bit for bit."""
+    assert Checkpoints(stopped).latest() == 2 and len(rows(stopped)) == 1
+    done = subprocess.run(
+        command("train", "--resume", "--run", stopped),
+        env=os.environ | {"PYTHONPATH": ROOT},
+        capture_output=True,
+        text=True,
+        timeout=500,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    whole, halves = leaves(trained), leaves(stopped)
+    assert whole.keys() == halves.keys() and len(whole) > 30
+    for name, leaf in whole.items():
+        np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
+    assert int(whole[".iteration"]) == 10
+    # An evaluation is logged where time runs out; apart from it every row agrees to its last digit.
+    for a, b in zip(rows(trained), rows(stopped), strict=True):
+        differ = [k for k in a if a[k] != b[k] and not (k.startswith("eval/") and not a[k])]
+        assert not differ, differ
+
+
+@pytest.mark.slow
+def test_sigterm_saves_and_ends_well(tmp_path):
+    folder = tmp_path / "run"
+    # Twenty thousand iterations: it cannot end before the signal.
+    changes = TINY | {"transitions": 64 * 20_000, "evaluations": (1.0,)}
+    process = subprocess.Popen(
+        command("train", "--preset", "smoke", "--run", folder, *settings(changes)),
+        env=os.environ | {"PYTHONPATH": ROOT},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        until = time.monotonic() + 300
+        while time.monotonic() < until and process.poll() is None:
+            if (folder / "metrics.csv").exists() and len(rows(folder)) >= 2:
+                break
+            time.sleep(0.2)
+        process.send_signal(signal.SIGTERM)
+        said, _ = process.communicate(timeout=200)
+    finally:
+        if process.poll() is None:
+            process.kill()
+    assert process.returncode == 0, said
+    assert "stopping after the iterations in hand" in said and "Go on with --resume" in said
+    saved = Checkpoints(folder).latest()
+    assert saved == int(rows(folder)[-1]["iteration"]) >= 4
+
+    # It goes on from there, and an end that is a time budget's is clean too.
+    cli.main(["train", "--resume", "--run", str(folder), "--minutes", "0.01"])
+    assert Checkpoints(folder).latest() > saved
+    iterations = [int(r["iteration"]) for r in rows(folder)]
+    assert iterations == list(range(2, iterations[-1] + 1, 2))
+
+
+@pytest.mark.slow
+def test_rows_beyond_the_checkpoint_are_written_again(trained, tmp_path):
+    """A process that is killed after it logged and before it saved leaves rows that a resume computes anew."""
+    folder = tmp_path / "run"
+    shutil.copytree(trained, folder)
+    shutil.rmtree(folder / "checkpoints" / "10")
+    expected = rows(folder)
+    assert runs.train(runs.Run.open(folder), resume=True)
+    assert rows(folder) == expected
+    for name, leaf in leaves(trained).items():
+        np.testing.assert_array_equal(leaf, leaves(folder)[name], err_msg=name)
+
+
+# --- bad checkpoints -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_truncated_checkpoint_is_named(trained, trainer, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(trained, folder)
+    largest = max((p for p in (folder / "checkpoints" / "10").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
+    with pytest.raises(UserError) as error:
+        Checkpoints(folder).restore(trainer.init())
+    assert str(folder / "checkpoints" / "10") in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [({"ppo.hidden": (24,)}, "expected float32"), ({"ppo.hidden": (16, 16)}, "only one of the two")],
+)
+def test_a_checkpoint_of_another_configuration_is_refused(trained, trainer, changes, said):
+    other = Trainer(tiny(**changes), trainer.clip)
+    with pytest.raises(UserError, match="is of another configuration") as error:
+        Checkpoints(trained).restore(other.init())
+    assert said in str(error.value) and str(trained) in str(error.value)
+
+
+def test_no_checkpoint_is_said(tmp_path):
+    with pytest.raises(UserError, match="has no checkpoint in checkpoints/"):
+        Checkpoints(tmp_path).restore(None)
+    with pytest.raises(UserError, match="has no checkpoint in best/"):
+        Checkpoints(tmp_path).restore(None, best=True)
+
+
+# --- parts -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("windows", "size"), [(370, 256), (342, 256), (256, 256), (40, 256), (1000, 7), (1, 5)])
+def test_expert_bank_is_even_and_in_range(windows, size):
+    for seed in range(20):
+        picked = np.asarray(expert_bank_rows(jax.random.PRNGKey(seed), windows, size))
+        assert picked.shape == (size,) and picked.min() >= 0 and picked.max() < windows
+        # Every gap, that around the end included, is the mean one rounded down or up; so are the repetitions.
+        gaps = np.diff(np.append(picked, picked[0] + windows))
+        assert gaps.min() >= windows // size and gaps.max() <= -(-windows // size)
+        counts = np.bincount(picked, minlength=windows)
+        assert counts.max() <= -(-size // windows) and counts.min() >= size // windows if size >= windows else True
+
+
+def test_a_clip_of_another_rate_or_robot_is_refused(walk):
+    import dataclasses
+
+    with pytest.raises(UserError, match="30 samples a second: expected the control rate, 50 Hz"):
+        Trainer(tiny(), dataclasses.replace(walk, rate=30.0))
+    with pytest.raises(UserError, match="of robot 'other'"):
+        Trainer(tiny(), dataclasses.replace(walk, robot="other"))
+
+
+def test_a_configuration_survives_its_file():
+    changed = tiny(**{"seed": 7, "frames": "3:99", "ppo.hidden": (5, 4, 3)})
+    assert config.from_json(config.to_json(changed)) == changed
+
+
+@pytest.mark.slow
+def test_seeds_decide_the_start(trainer):
+    def flat(state):
+        return np.concatenate([np.asarray(x, np.float64).ravel() for x in jax.tree.leaves(state)])
+
+    again, other = Trainer(tiny(), trainer.clip), Trainer(tiny(seed=1), trainer.clip)
+    np.testing.assert_array_equal(flat(trainer.init()), flat(again.init()))
+    assert np.any(flat(trainer.init()) != flat(other.init()))
+    assert np.any(np.asarray(trainer.expert_bank) != np.asarray(other.expert_bank))
+
+
+# --- evaluation ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def evaluator(trainer):
+    return Evaluator(trainer, 6)
+
+
+@pytest.fixture(scope="module")
+def fallen(trainer, evaluator):
+    """Episodes of a policy that throws itself down: every target far off in one direction."""
+    state = trainer.init().ppo
+    params = jax.tree.map(jnp.zeros_like, state.actor)
+    params["params"]["Dense_0"]["bias"] += 20.0
+    return evaluator.play(state._replace(actor=params))
+
+
+@pytest.mark.slow
+def test_a_policy_that_falls_is_counted_to_its_fall(trainer, evaluator, fallen):
+    assert fallen.qpos.shape == (60, 6, 7 + trainer.robot.joint_count)
+    assert fallen.fell.all() and (fallen.length > 2).all() and (fallen.length < 60).all()
+    for i, length in enumerate(fallen.length):
+        # The fall is on the last step that counts; after it nothing moves.
+        observed = trainer.env._observe(jnp.asarray(fallen.qpos[:, i]), jnp.asarray(fallen.qvel[:, i]))
+        expected = np.arange(60) >= length - 1
+        np.testing.assert_array_equal(observed.fallen, expected)
+        assert (fallen.qpos[length - 1 :, i] == fallen.qpos[length - 1, i]).all()
+        assert np.any(fallen.qpos[length - 2, i] != fallen.qpos[length - 1, i])
+    result = evaluator.measure(fallen)
+    assert result.episodes == result.falls == 6 and result.quality == 0.0
+    np.testing.assert_allclose(result.mean_length, fallen.length.mean())
+    # Nobody lives to five seconds, so there is no late speed, and that is said, not made up.
+    assert result.late_n == 0 and np.isnan(result.late_speed)
+    assert json.loads(result.to_json())["late_speed"] is None
+    assert result.sinkhorn > 0.01
+
+
+@pytest.mark.slow
+def test_the_demonstration_itself_scores_perfectly(trainer, fallen):
+    """Episodes that replay the clip: its excursion, its amplitude, and next to no discrepancy."""
+    clip, horizon = trainer.clip, trainer.env.horizon
+    evaluator = Evaluator(trainer, 4)
+    steps = 300
+    starts = np.array([horizon - 1, 20, 30, 40])
+    index = starts[None] + 1 + np.arange(steps)[:, None]
+    table = np.asarray(trainer.env._table.frame)
+    played = Episodes(
+        qpos=clip.qpos[index].astype(np.float32),
+        qvel=clip.qvel[index].astype(np.float32),
+        length=np.full(4, steps),
+        fell=np.zeros(4, bool),
+        start_qpos=clip.qpos[starts].astype(np.float32),
+        history=np.stack([table[s - horizon + 1 : s + 1] for s in starts]),
+    )
+    result = evaluator.measure(played)
+    assert result.falls == 0 and result.mean_length == steps
+    np.testing.assert_allclose(result.excursion, 1.0, atol=0.05)
+    assert result.amplitude_mae < 1.5 and 0 <= result.contact_foot_speed < 0.3 and result.imbalance < 0.1
+    assert result.sinkhorn < evaluator.measure(fallen).sinkhorn / 20
+    np.testing.assert_allclose(result.displacement, steps / clip.rate * result.demonstration_speed, rtol=0.1)
+
+
+@pytest.mark.slow
+def test_evaluations_start_from_matched_resets(trainer, evaluator, fallen):
+    again = Evaluator(trainer, 6)
+    np.testing.assert_array_equal(again.rows, evaluator.rows)
+    np.testing.assert_array_equal(fallen.start_qpos, trainer.clip.qpos[evaluator.rows].astype(np.float32))
