@@ -138,7 +138,11 @@ def test_servos_reach_their_targets(robot):
     qpos[:, 2] = 20.0
     targets = np.clip(qpos[:, 7:] + 0.2 * rng.uniform(-1, 1, (4, robot.joint_count)), robot.joint_low, robot.joint_high)
     course = advance(
-        physics.make(robot, PAPER), qpos.astype(np.float32), np.zeros((4, 35), np.float32), targets.astype(np.float32), 50
+        physics.make(robot, PAPER),
+        qpos.astype(np.float32),
+        np.zeros((4, 35), np.float32),
+        targets.astype(np.float32),
+        50,
     )
     error = np.abs(course.qpos[-1, :, 7:] - targets)
     print(f"servos after 1 s: worst error {error.max():.4f} rad")
@@ -169,7 +173,9 @@ def test_laptop_rate_walks_like_the_paper_rate(robot, states):
     qpos, qvel, _ = (x[4:] for x in states)
     courses = [advance(physics.make(robot, c), qpos, qvel, qpos[:, 7:], 3) for c in (PAPER, LAPTOP)]
     gap = np.abs(courses[0].qpos - courses[1].qpos)
-    print(f"100 Hz against 200 Hz, walking: root {gap[..., :3].max() * 1e3:.2f} mm, joints {gap[..., 7:].max():.4f} rad")
+    print(
+        f"100 Hz against 200 Hz, walking: root {gap[..., :3].max() * 1e3:.2f} mm, joints {gap[..., 7:].max():.4f} rad"
+    )
     assert gap[..., :3].max() < 0.01 and gap[..., 7:].max() < 0.05
 
 
@@ -183,7 +189,9 @@ def test_mjx_steps_like_native(robot, states):
     qpos, qvel, targets = (x[pick] for x in states)
     config = dataclasses.replace(LAPTOP, iterations=10, ls_iterations=20)
     ours = advance(physics.make(robot, config), qpos, qvel, targets, 3)
-    theirs = advance(physics.make(robot, dataclasses.replace(config, backend="mjx", impl="jax")), qpos, qvel, targets, 3)
+    theirs = advance(
+        physics.make(robot, dataclasses.replace(config, backend="mjx", impl="jax")), qpos, qvel, targets, 3
+    )
     gaps = {}
     for name, rows in (("standing", slice(0, 2)), ("in the air", slice(2, 4)), ("walking", slice(4, None))):
         gap = gaps[name] = [np.abs(a - b)[:, rows].max(axis=(1, 2)) for a, b in zip(ours[:2], theirs[:2], strict=True)]

@@ -254,9 +254,7 @@ def test_ratio_clip(sign, moves):
     # present mean as much more frequent.
     elsewhere = batch.mean + batch.deviation
     raised = good[..., None] * sign > 0
-    batch = batch._replace(
-        action=jnp.where(raised, batch.mean, elsewhere), mean=elsewhere, reward=10.0 * good
-    )
+    batch = batch._replace(action=jnp.where(raised, batch.mean, elsewhere), mean=elsewhere, reward=10.0 * good)
     new, metrics = update(state, batch, jax.random.PRNGKey(0))
     np.testing.assert_allclose(metrics["clipped"], 1.0)
     assert same(new.actor, state.actor) != moves

@@ -263,7 +263,9 @@ def test_rows_beyond_the_checkpoint_are_written_again(trained, tmp_path):
 def test_a_truncated_checkpoint_is_named(trained, trainer, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(trained, folder)
-    largest = max((p for p in (folder / "checkpoints" / "10").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    largest = max(
+        (p for p in (folder / "checkpoints" / "10").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size
+    )
     largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
     with pytest.raises(UserError) as error:
         Checkpoints(folder).restore(trainer.init())

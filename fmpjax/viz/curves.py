@@ -9,23 +9,25 @@ from matplotlib.figure import Figure
 
 from fmpjax.errors import UserError
 
-# What a reader asks first stands first; columns that are not named here follow under their own names.
+# The panels, in order: how long it lives, how it moves, what was fitted, how it learns. TensorBoard has every metric.
 TITLES = {
-    "train/episode_length": "episode length",
-    "train/falls": "falls in training",
+    "train/episode_length": "episode length, steps",
+    "env/cap": "episode cap, steps",
+    "train/falls": "share of episodes that fall",
     "train/speed": "speed in training, m/s",
     "eval/late_speed": "evaluation: late speed, m/s",
-    "eval/falls": "evaluation: falls",
     "eval/excursion": "evaluation: excursion",
-    "train/reward_spread": "spread of the reward",
+    "eval/falls": "evaluation: falls",
+    "eval/sinkhorn": "evaluation: Sinkhorn discrepancy",
     "fit/value_loss": "value loss",
     "fit/endpoint_loss": "endpoint loss",
     "fit/flow_loss": "flow loss",
-    "ppo/kl": "PPO: KL divergence",
-    "ppo/deviation": "PPO: action deviation",
-    "env/cap": "cap of the episode length",
+    "fit/score_spread": "score spread (IQR)",
+    "ppo/kl": "KL divergence",
+    "ppo/deviation": "action deviation",
+    "ppo/explained_variance": "explained variance",
+    "fit/expert_margin": "demonstration's margin, spreads",
 }
-COUNTERS = ("iteration", "transitions", "seconds")
 COLUMNS = 4
 SPARSE = 0.5  # a curve with values in fewer rows than this is drawn as points
 COLOURS = {"train": "#2a6fb0", "eval": "#c8553d", "fit": "#3a8a6b", "ppo": "#7a5ba6"}
@@ -33,24 +35,22 @@ OTHER_COLOUR = "#5b6673"
 
 
 def learning_curves(csv_path: str | Path, png_path: str | Path) -> Path:
-    """Draw every metric of a run over its transitions as small panels of one PNG; returns its path.
+    """Draw a run's main metrics over its transitions as small panels of one PNG; returns its path.
 
-    Thin lines are the values, thick ones their running mean. Columns without a value are left out.
+    Thin lines are the values, thick ones their running mean. Columns that are missing or empty are left out.
 
     Raises:
       UserError: the table cannot be read or has no metrics, or the picture cannot be written.
     """
     csv_path, png_path = Path(csv_path), Path(png_path)
     table = _read(csv_path)
-    names = [name for name in TITLES if name in table]
-    names += [name for name in table if name not in TITLES and name not in COUNTERS]
-    names = [name for name in names if np.isfinite(table[name]).any()]
+    names = [name for name in TITLES if name in table and np.isfinite(table[name]).any()]
     if not names:
         raise UserError(f"{csv_path} has no metrics to draw: expected rows with columns such as {next(iter(TITLES))}")
     across, label = _horizontal(table)
     columns = min(COLUMNS, len(names))
     rows = -(-len(names) // columns)
-    figure = Figure((3.2 * columns, 2.1 * rows + 0.2), dpi=120, layout="constrained")
+    figure = Figure((3.2 * columns, 2.1 * rows + 0.2), dpi=90, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for panel, name in zip(panels.flat, names, strict=False):
@@ -78,7 +78,7 @@ def _draw(panel, name: str, across: np.ndarray, values: np.ndarray) -> None:
     else:
         panel.plot(x, y, color=colour, linewidth=0.7, alpha=0.35)
         panel.plot(x, _running_mean(y, max(1, len(y) // 50)), color=colour, linewidth=1.6)
-    panel.set_title(TITLES.get(name, name), fontsize=9, loc="left")
+    panel.set_title(TITLES[name], fontsize=9, loc="left")
     panel.tick_params(labelsize=7, length=2)
     panel.grid(alpha=0.25, linewidth=0.5)
     panel.spines[["top", "right"]].set_visible(False)
