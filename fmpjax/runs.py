@@ -29,6 +29,8 @@ from fmpjax.viz import curves, render
 
 _PACKAGES = "jax jaxlib mujoco mujoco-mjx brax flax optax ott-jax orbax-checkpoint numpy".split()
 
+_SAVE_INTERVAL = 120.0  # s between checkpoints at most, but for the iterations in hand
+
 
 def load_motion(config: Config) -> motion.MotionClip:
     """The demonstration that a configuration names, at its control rate."""
@@ -134,7 +136,7 @@ def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> bo
     log = MetricsLog(run.folder, [*metric_names, *names], done)
     milestones = _milestones(config)
     best = _best_quality(log)
-    training_seconds = log.seconds
+    training_seconds, saved = log.seconds, time.monotonic()
 
     with _StopSignals() as stop:
         while done < config.iterations:
@@ -154,16 +156,20 @@ def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> bo
             out_of_time = minutes is not None and time.monotonic() - began + 1.5 * took > minutes * 60
             stopping = out_of_time or stop.requested
             at_milestone = any(done >= m > done - config.chunk for m in milestones)
-            if (at_milestone or out_of_time) and not stop.requested:
+            evaluating = (at_milestone or out_of_time) and not stop.requested
+            if evaluating:
                 evaluation = evaluator(state.ppo)
                 metrics |= {f"eval/{name}": float(value) for name, value in evaluation.as_dict().items()}
                 progress.note(f"evaluation at {transitions:,} transitions, {clock(training_seconds)} of training:")
                 progress.note(table(evaluation))
-                if evaluation.quality >= best:
-                    best = evaluation.quality
-                    run.checkpoints.save(state, best=True)
-                run.checkpoints.save(state)
+            # Rows ahead of their checkpoint are computed again after a kill; rows behind it would be missing.
             log.write(done, transitions, training_seconds, metrics)
+            if evaluating and evaluation.quality >= best:
+                best = evaluation.quality
+                run.checkpoints.save(state, best=True)
+            if evaluating or time.monotonic() - saved > _SAVE_INTERVAL:
+                run.checkpoints.save(state)
+                saved = time.monotonic()
             if stopping:
                 break
         run.checkpoints.save(state)
@@ -193,8 +199,7 @@ def finish(run: Run) -> list[Path]:
 
 
 _EXPORTED = (
-    "config.json provenance.json metrics.csv evaluation.json ranking-start.json ranking.json curves.png frames.png "
-    "policy.mp4 policy.gif"
+    "metrics.csv evaluation.json ranking-start.json ranking.json curves.png frames.png policy.mp4 policy.gif"
 ).split()
 
 
@@ -204,11 +209,17 @@ def export(run: Run, out: Path) -> list[Path]:
     Raises:
       UserError: ``out`` holds another run's results, or cannot be written.
     """
-    if (out / "config.json").exists() and (out / "config.json").read_text() != (run.folder / "config.json").read_text():
+    # Where the demonstration lay is this machine's affair; its name is everybody's.
+    where, name = run.config.motion, Path(run.config.motion).name
+    texts = {n: (run.folder / n).read_text().replace(where, name) for n in ("config.json", "provenance.json")}
+    if (out / "config.json").exists() and (out / "config.json").read_text() != texts["config.json"]:
         raise UserError(f"{out} holds results of another configuration: expected a new folder or this run's own")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        return [Path(shutil.copy2(run.folder / n, out / n)) for n in _EXPORTED if (run.folder / n).exists()]
+        for n, text in texts.items():
+            _write(out / n, text.rstrip("\n"))
+        copied = [Path(shutil.copy2(run.folder / n, out / n)) for n in _EXPORTED if (run.folder / n).exists()]
+        return [*(out / n for n in texts), *copied]
     except OSError as error:
         raise UserError(f"folder {out} cannot be written: {error.strerror}") from None
 

@@ -44,6 +44,11 @@ class Trainer:
             )
         if clip.robot != config.robot:
             raise UserError(f"motion {clip.name} is of robot {clip.robot!r}: expected {config.robot!r}")
+        if len(clip) <= config.features.history:
+            raise UserError(
+                f"setting features.history is {config.features.history}: expected fewer than the {len(clip)} samples "
+                f"of motion {clip.name}"
+            )
         self.config, self.clip = config, clip
         self.robot = robots.load(config.robot)
         self.env = Env(self.robot, clip, config, physics.make(self.robot, config.physics))

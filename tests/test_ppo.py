@@ -144,7 +144,7 @@ def test_advantages_equal_a_slow_loop(gae_lambda):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_advantage_plus_value_is_the_td_lambda_return(data, seed):
-    """Against recorded TD(0.95) returns; within an episode V(s_t+1) is the next value of step t, elsewhere it is free."""
+    """Against recorded TD(0.95) returns; within an episode V(s_t+1) is step t's next value, elsewhere it is free."""
     case = np.load(data / "features.npz")
     reward, next_value = case["td_reward"], case["td_next_value"]
     fell, timed_out = case["td_fell"], case["td_timeout"]

@@ -1,6 +1,7 @@
 """A run from its first iteration to its last, interrupted and resumed in every way that must not matter."""
 
 import csv
+import dataclasses
 import json
 import logging
 import os
@@ -252,8 +253,9 @@ def test_rows_beyond_the_checkpoint_are_written_again(trained, tmp_path):
     expected = rows(folder)
     assert runs.train(runs.Run.open(folder), resume=True)
     assert rows(folder) == expected
+    again = leaves(folder)
     for name, leaf in leaves(trained).items():
-        np.testing.assert_array_equal(leaf, leaves(folder)[name], err_msg=name)
+        np.testing.assert_array_equal(leaf, again[name], err_msg=name)
 
 
 # --- bad checkpoints -------------------------------------------------------------------------------------------------
@@ -307,12 +309,16 @@ def test_expert_bank_is_even_and_in_range(windows, size):
 
 
 def test_a_clip_of_another_rate_or_robot_is_refused(walk):
-    import dataclasses
-
     with pytest.raises(UserError, match="30 samples a second: expected the control rate, 50 Hz"):
         Trainer(tiny(), dataclasses.replace(walk, rate=30.0))
     with pytest.raises(UserError, match="of robot 'other'"):
         Trainer(tiny(), dataclasses.replace(walk, robot="other"))
+
+
+def test_a_clip_shorter_than_a_window_is_refused(walk):
+    short = dataclasses.replace(walk, qpos=walk.qpos[:20], qvel=walk.qvel[:20])
+    with pytest.raises(UserError, match="features.history is 20: expected fewer than the 20 samples"):
+        Trainer(tiny(**{"features.history": 20}), short)
 
 
 def test_a_configuration_survives_its_file():

@@ -422,7 +422,7 @@ def _write_mp4(encoder, path: Path, frames: np.ndarray, fps: float) -> None:
     # The format wants even sides.
     height, width = frames.shape[1] // 2 * 2, frames.shape[2] // 2 * 2
     writer = encoder.write_frames(
-        str(path), (width, height), fps=fps, quality=8, macro_block_size=2, ffmpeg_log_level="error"
+        str(path), (width, height), fps=fps, quality=6, macro_block_size=2, ffmpeg_log_level="error"
     )
     writer.send(None)
     for frame in frames:
