@@ -49,9 +49,9 @@ class Train:
             raise UserError(f"--minutes is {self.minutes:g}: expected more than 0")
         run = self._open()
         runs = _runs()
-
-        finished = runs.train(run, resume=self.resume, minutes=self.minutes)
-        if finished or run.checkpoints.latest(best=True) is not None:
+        end = runs.train(run, resume=self.resume, minutes=self.minutes)
+        # Who sends a signal wants the process to end, not to film.
+        if end is not runs.End.SIGNAL:
             for path in runs.finish(run):
                 print(f"wrote {path}")
 
@@ -93,7 +93,7 @@ class Train:
         changes = {key: value for key, value in named.items() if value is not None}
         for item in self.set:
             key, equals, value = item.partition("=")
-            if not equals:
+            if not equals or key == "preset":
                 raise UserError(f"--set {item!r}: expected section.field=value")
             changes[key] = value
         return changes

@@ -76,6 +76,9 @@ class Evaluator:
         self.trainer = trainer
         self.count = episodes or trainer.config.evaluation_episodes
         # Matched resets: every evaluation of a configuration starts from the same states.
+        robot = trainer.robot
+        self._poses = jax.jit(partial(kinematics.body_poses, robot))
+        self._frames = jax.jit(lambda qpos, qvel: features.observe(robot, qpos, qvel, "compact").frame)
         self.rows = np.asarray(trainer.env.reset_rows(jax.random.PRNGKey(seed), self.count))
 
     @partial(jax.jit, static_argnums=0)
@@ -155,7 +158,7 @@ class Evaluator:
     def _feet(self, qpos: jax.Array) -> tuple[np.ndarray, np.ndarray]:
         """Foot positions ``[T, n, F, 3]`` (m, the mean of a foot's sole points) and contacts ``[T, n, F]``."""
         robot = self.trainer.robot
-        poses = jax.jit(partial(kinematics.body_poses, robot))(qpos)
+        poses = self._poses(qpos)
         soles = kinematics.points(poses, robot.sole_body, robot.sole_point)
         heights = kinematics.sole_heights(robot, poses)
         feet = np.unique(robot.sole_body)
@@ -168,7 +171,7 @@ class Evaluator:
         trainer = self.trainer
         horizon = trainer.env.horizon
         qpos, qvel = jnp.asarray(played.qpos[:, detail]), jnp.asarray(played.qvel[:, detail])
-        frames = jax.jit(lambda q, v: features.observe(trainer.robot, q, v, "compact").frame)(qpos, qvel)
+        frames = self._frames(qpos, qvel)
         frames = np.concatenate([np.swapaxes(played.history[detail], 0, 1), np.asarray(frames)])  # [H + T, n, F]
         steps, episodes = np.nonzero(np.arange(len(played.qpos))[:, None] < played.length[detail])
         # Evenly spaced samples in a fixed shuffled order: the same windows for the same lengths.

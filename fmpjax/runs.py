@@ -1,6 +1,7 @@
 """A run on disk: its folder, its training from start or checkpoint to a clean end, and what it leaves to look at."""
 
 import dataclasses
+import enum
 import importlib.metadata
 import json
 import os
@@ -49,6 +50,7 @@ class Run:
     def __init__(self, folder: str | Path):
         self.folder = Path(folder)
         self.checkpoints = Checkpoints(self.folder)
+        self._trainer: Trainer | None = None
 
     @classmethod
     def create(cls, folder: str | Path, config: Config) -> "Run":
@@ -65,7 +67,8 @@ class Run:
             run.folder.mkdir(parents=True, exist_ok=True)
             motion.save(clip, run.folder / "demonstration.npz")
             _write(run.folder / "provenance.json", json.dumps(provenance(), indent=1))
-            # Last: a folder with a configuration is a run.
+            run._trainer = Trainer(config, run._demonstration(config))
+            # Last: a folder with a configuration is a run, and what cannot be trained is none.
             _write(run.folder / "config.json", configuration.to_json(config))
         except OSError as error:
             raise UserError(f"run folder {run.folder} cannot be written: {error.strerror}") from None
@@ -88,14 +91,19 @@ class Run:
         path = self.folder / "config.json"
         try:
             return configuration.from_json(path.read_text())
-        except json.JSONDecodeError:
+        except (json.JSONDecodeError, UnicodeDecodeError, AttributeError):
             raise UserError(f"{path} is not valid JSON: expected a run's configuration") from None
 
     def trainer(self) -> Trainer:
         """The run's parts."""
-        config = self.config
-        clip = motion.load(self.folder / "demonstration.npz", rate=round(config.control_rate, 6), robot=config.robot)
-        return Trainer(config, clip)
+        if self._trainer is None:
+            config = self.config
+            self._trainer = Trainer(config, self._demonstration(config))
+        return self._trainer
+
+    def _demonstration(self, config: Config) -> motion.MotionClip:
+        """The clip as the folder holds it, whoever asks: the first process and a resumed one see the same bits."""
+        return motion.load(self.folder / "demonstration.npz", rate=round(config.control_rate, 6), robot=config.robot)
 
     def policy(self, *, best: bool = True) -> tuple[Trainer, TrainState]:
         """The run's parts and its best state, or its newest where no evaluation chose a best one."""
@@ -107,12 +115,16 @@ class Run:
         _write(self.folder / f"{name}.json", evaluation.to_json())
 
 
-def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> bool:
-    """Train a run to the end of its budget, or of its time, or until it is told to stop; all three end cleanly.
+class End(enum.Enum):
+    """Why training ended, saved in each case."""
 
-    Returns:
-      Whether the budget is spent.
-    """
+    BUDGET = "the budget is spent"
+    TIME = "time is up"
+    SIGNAL = "stopped"
+
+
+def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> End:
+    """Train a run to the end of its budget, or of its time, or until it is told to stop; all three end cleanly."""
     config, progress = run.config, Progress()
     began = time.monotonic()
     progress.note(
@@ -126,7 +138,7 @@ def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> bo
     done = int(state.iteration)
     if done >= config.iterations:
         progress.note(f"the budget of {config.transitions:,} transitions is spent already")
-        return True
+        return End.BUDGET
     progress.note(f"{trainer.env.physics.name} physics on {_device_name()}; compiling, which takes a minute or so ...")
     compile_began = time.monotonic()
     chunk = trainer.compile(state)
@@ -135,7 +147,7 @@ def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> bo
     metric_names = sorted(jax.eval_shape(trainer.iteration, state)[1])
     log = MetricsLog(run.folder, [*metric_names, *names], done)
     milestones = _milestones(config)
-    best = _best_quality(log)
+    best, evaluated = _best(log)
     training_seconds, saved = log.seconds, time.monotonic()
 
     with _StopSignals() as stop:
@@ -155,10 +167,10 @@ def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> bo
             _check_finite(run, state, config)
             out_of_time = minutes is not None and time.monotonic() - began + 1.5 * took > minutes * 60
             stopping = out_of_time or stop.requested
-            at_milestone = any(done >= m > done - config.chunk for m in milestones)
+            at_milestone = any(done >= m > evaluated for m in milestones)
             evaluating = (at_milestone or out_of_time) and not stop.requested
             if evaluating:
-                evaluation = evaluator(state.ppo)
+                evaluation, evaluated = evaluator(state.ppo), done
                 metrics |= {f"eval/{name}": float(value) for name, value in evaluation.as_dict().items()}
                 progress.note(f"evaluation at {transitions:,} transitions, {clock(training_seconds)} of training:")
                 progress.note(table(evaluation))
@@ -174,10 +186,11 @@ def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> bo
                 break
         run.checkpoints.save(state)
     log.close()
-    if done < config.iterations:
-        reason = "stopped" if stop.requested else "time is up"
-        progress.note(f"{reason} at {transitions:,} transitions; saved. Go on with --resume.")
-    return done >= config.iterations
+    if done >= config.iterations:
+        return End.BUDGET
+    end = End.SIGNAL if stop.requested else End.TIME
+    progress.note(f"{end.value} at {transitions:,} transitions; saved. Go on with --resume.")
+    return end
 
 
 def finish(run: Run) -> list[Path]:
@@ -291,8 +304,12 @@ def _milestones(config: Config) -> list[int]:
     return [max(1, round(share * config.iterations)) for share in config.evaluations]
 
 
-def _best_quality(log: MetricsLog) -> float:
-    return max((float(row["eval/quality"]) for row in log.rows if row.get("eval/quality")), default=-1.0)
+def _best(log: MetricsLog) -> tuple[float, int]:
+    """Best quality so far, and the last iteration that was evaluated."""
+    rows = [row for row in log.rows if row.get("eval/quality")]
+    return max((float(row["eval/quality"]) for row in rows), default=-1.0), max(
+        (int(row["iteration"]) for row in rows), default=0
+    )
 
 
 def _line(transitions: int, config: Config, rate: float, left: float, m: dict[str, float]) -> str:

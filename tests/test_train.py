@@ -93,7 +93,7 @@ def trained(tmp_path_factory, compiled_programs):
     log.addHandler(listener)
     try:
         with jax.log_compiles():
-            assert runs.train(run)
+            assert runs.train(run) is runs.End.BUDGET
     finally:
         log.removeHandler(listener)
     return folder
@@ -104,7 +104,7 @@ def stopped(tmp_path_factory):
     """The same run, stopped by its time budget after the first chunk."""
     folder = tmp_path_factory.mktemp("train") / "halved"
     run = runs.Run.create(folder, tiny())
-    assert not runs.train(run, minutes=1e-6)
+    assert runs.train(run, minutes=1e-6) is runs.End.TIME
     return folder
 
 
@@ -165,7 +165,7 @@ def test_save_keeps_three_and_only_one_best(trainer, tmp_path):
 @pytest.mark.slow
 def test_a_spent_budget_trains_no_further(trained):
     before = rows(trained)
-    assert runs.train(runs.Run.open(trained), resume=True)
+    assert runs.train(runs.Run.open(trained), resume=True) is runs.End.BUDGET
     assert rows(trained) == before and Checkpoints(trained).latest() == 10
 
 
@@ -245,14 +245,17 @@ def test_sigterm_saves_and_ends_well(tmp_path):
 
 
 @pytest.mark.slow
-def test_rows_beyond_the_checkpoint_are_written_again(trained, tmp_path):
+def test_rows_beyond_the_checkpoint_are_written_again(trained, tmp_path, monkeypatch):
     """A process that is killed after it logged and before it saved leaves rows that a resume computes anew."""
     folder = tmp_path / "run"
     shutil.copytree(trained, folder)
     shutil.rmtree(folder / "checkpoints" / "10")
     expected = rows(folder)
-    assert runs.train(runs.Run.open(folder), resume=True)
+    # Checkpoints come by the clock too: with no interval, after every chunk.
+    monkeypatch.setattr(runs, "_SAVE_INTERVAL", 0.0)
+    assert runs.train(runs.Run.open(folder), resume=True) is runs.End.BUDGET
     assert rows(folder) == expected
+    assert {p.name for p in (folder / "checkpoints").iterdir() if p.name.isdigit()} == {"6", "8", "10"}
     again = leaves(folder)
     for name, leaf in leaves(trained).items():
         np.testing.assert_array_equal(leaf, again[name], err_msg=name)
