@@ -23,14 +23,11 @@ class MjxPhysics:
         if jax.default_backend() == "cpu":
             # Measured on two cores: the dense Jacobian is seventy times slower there.
             self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-        buffers = {}
-        if config.impl == "warp":
-            if jax.default_backend() != "gpu":
-                raise UserError("physics.impl is 'warp': expected an NVIDIA device, found " + jax.default_backend())
-            buffers = {"nconmax": config.max_contacts, "njmax": config.max_constraints}
+        if config.impl == "warp" and jax.default_backend() != "gpu":
+            raise UserError("physics.impl is 'warp': expected an NVIDIA device, found " + jax.default_backend())
         try:
             self._model = mjx.put_model(self.model, impl=config.impl)
-            self._data = mjx.make_data(self.model, impl=config.impl, **buffers)
+            self._data(1)
         except (ImportError, RuntimeError) as error:
             if config.impl != "warp":
                 raise
@@ -38,9 +35,18 @@ class MjxPhysics:
                 f"physics.impl is 'warp', which this installation lacks ({error}): install fmpjax[warp]"
             ) from None
 
+    def _data(self, count: int) -> mjx.Data:
+        """State of one world; Warp's contact buffer is shared by all ``count`` of them."""
+        config, buffers = self.config, {}
+        if config.impl == "warp":
+            buffers = {"naconmax": count * config.max_contacts, "njmax": config.max_constraints}
+        return mjx.make_data(self.model, impl=config.impl, **buffers)
+
     def step(self, state: PhysicsState, targets: jax.Array) -> PhysicsState:
+        template = self._data(len(state.qpos))
+
         def one(qpos, qvel, warmstart, target):
-            data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=target)
+            data = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=target)
             data, _ = jax.lax.scan(
                 lambda d, _: (mjx.step(self._model, d), None), data, None, length=self.config.substeps
             )
