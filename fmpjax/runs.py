@@ -268,10 +268,13 @@ def _stride_frames(trainer: Trainer, played) -> np.ndarray:
 
 def provenance() -> dict[str, object]:
     """Command, commit, versions and machine of this process."""
+    here = Path(__file__).parent
 
     def git(*arguments: str) -> str | None:
+        # An installed wheel may lie in somebody else's repository.
+        if not (here.parent / "pyproject.toml").exists():
+            return None
         try:
-            here = Path(__file__).parent
             done = subprocess.run(["git", *arguments], cwd=here, capture_output=True, text=True, timeout=10, check=True)
             return done.stdout.strip()
         except (OSError, subprocess.SubprocessError):

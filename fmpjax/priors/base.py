@@ -1,4 +1,4 @@
-"""The interface of every motion prior: a pair of pure functions, as in optax."""
+"""The interface of every motion prior: pure functions, as in optax."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
