@@ -41,12 +41,10 @@ def product_flops(settings: PriorConfig, size: int) -> dict[str, float]:
     # points themselves need none.
     layers = [(size, settings.hidden[0], 5), (size, potential.HEADS, 4)]
     layers += [(i, o, 6) for i, o in zip(settings.hidden, (*settings.hidden[1:], potential.HEADS), strict=True)]
-    scored = sum(2 * query * i * o for i, o, _ in layers)
     return {
         "costs": 2.0 * size * (bank * bank * 2 + query * bank * 2),
         "teacher gradient": 2.0 * size * query * bank * 2,
         "network": sum(2.0 * points * i * o * times for i, o, times in layers),
-        "correlation metric": float(scored),
     }
 
 
@@ -82,7 +80,6 @@ def parts(settings: PriorConfig, dimension, source, query, expert, params) -> di
     optimizer = optax.chain(optax.clip_by_global_norm(settings.clip_norm), optax.adam(settings.learning_rate))
     adam, gradients = optimizer.init(params), network(params)[1]
     step = jax.jit(lambda g, a, p: optimizer.update(g, a, p))
-    correlate = jax.jit(lambda p: potential.score(p, query, dimension))
     return {
         "costs": lambda: costs(source, query, expert),
         "median": lambda: entropy(cross),
@@ -91,7 +88,6 @@ def parts(settings: PriorConfig, dimension, source, query, expert, params) -> di
         "flow samples": lambda: sample(jax.random.PRNGKey(0)),
         "losses and gradient": lambda: network(params),
         "Adam": lambda: step(gradients, adam, params),
-        "correlation metric": lambda: correlate(params),
     }
 
 

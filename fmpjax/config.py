@@ -36,16 +36,12 @@ class EnvConfig:
     count: int = 1024  # parallel environments [P]
     reset: str = "dataset"  # "dataset" (a demonstration state) or "fixed" (the default pose) [P]
     episode_steps: int = 500  # control steps, 10 s [P]
-    first_cap: int = (
-        500  # the episode cap at the start; below episode_steps it grows as episodes survive [P: no growth]
-    )
+    first_cap: int = 500  # episode cap at the start; below episode_steps it grows as episodes survive [P: 500]
     cap_growth: float = 1.25  # factor of a growth step [D]
     cap_share: float = 0.75  # share of episodes that end by the cap above which the cap grows [D]
     cap_patience: int = 25  # rollouts between two growth steps at least [D]
     observation: str = "full"  # "full": 237 numbers [P]; "compact": 86 that carry the same information [D]
-    action: str = (
-        "absolute"  # "absolute": 1.4 max|limit| around zero [M]; "residual": 0.25 effort/kp around the mean [D]
-    )
+    action: str = "absolute"  # 1.4 max|limit| around zero [M], or "residual": 0.25 effort/kp around the mean [D]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -66,10 +66,10 @@ class Run:
         try:
             run.folder.mkdir(parents=True, exist_ok=True)
             motion.save(clip, run.folder / "demonstration.npz")
-            _write(run.folder / "provenance.json", json.dumps(provenance(), indent=1))
+            write(run.folder / "provenance.json", json.dumps(provenance(), indent=1))
             run._trainer = Trainer(config, run._demonstration(config))
             # Last: a folder with a configuration is a run, and what cannot be trained is none.
-            _write(run.folder / "config.json", configuration.to_json(config))
+            write(run.folder / "config.json", configuration.to_json(config))
         except OSError as error:
             raise UserError(f"run folder {run.folder} cannot be written: {error.strerror}") from None
         return run
@@ -112,7 +112,7 @@ class Run:
         return trainer, self.checkpoints.restore(trainer.init(), best=best)
 
     def save_evaluation(self, evaluation: Evaluation, name: str = "evaluation") -> None:
-        _write(self.folder / f"{name}.json", evaluation.to_json())
+        write(self.folder / f"{name}.json", evaluation.to_json())
 
 
 class End(enum.Enum):
@@ -230,7 +230,7 @@ def export(run: Run, out: Path) -> list[Path]:
     try:
         out.mkdir(parents=True, exist_ok=True)
         for n, text in texts.items():
-            _write(out / n, text.rstrip("\n"))
+            write(out / n, text.rstrip("\n"))
         copied = [Path(shutil.copy2(run.folder / n, out / n)) for n in _EXPORTED if (run.folder / n).exists()]
         return [*(out / n for n in texts), *copied]
     except OSError as error:
@@ -359,7 +359,7 @@ class _StopSignals:
             signal.signal(number, handler)
 
 
-def _write(path: Path, text: str) -> None:
+def write(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
     partial = path.with_name(path.name + ".partial")
     partial.write_text(text + "\n")

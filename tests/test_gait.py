@@ -4,21 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from fmpjax import motion, robots
+from fmpjax import motion
 from fmpjax.errors import UserError
 from fmpjax.motion import gait
 
 STRIDE = 54  # samples
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return robots.load("unitree_g1")
-
-
-@pytest.fixture(scope="module")
-def walk():
-    return motion.load("walk")
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ as ``python -m fmpjax.experiments.ranking --run RUN`` or, for the start of train
 
 import dataclasses
 import json
-import os
+import sys
 from pathlib import Path
 
 import jax
@@ -83,11 +83,12 @@ def rank(trainer: Trainer, windows: jax.Array, key: jax.Array, updates: int = 51
     """Fit the prior to ``windows [T, N, D]`` and score the copies.
 
     Returns:
-      By copy: mean reward, and the share of windows that a random window of the demonstration beats.
+      By copy: mean reward, mean score above the pool's median in spreads of the pool (``margin``), and how often a
+      random window of the demonstration scores above one of the copy's (``beaten``).
     """
     config = dataclasses.replace(trainer.config.prior, updates=updates)
     prior = priors.make(trainer.config.method, trainer.expert_bank, float(trainer.feature_map.dimension), config)
-    init_key, fit_key, reward_key = jax.random.split(key, 3)
+    init_key, fit_key = jax.random.split(key)
     valid = jnp.ones(windows.shape[:2], bool)
     fit = jax.jit(prior.update)
     state, _, metrics = fit(prior.init(init_key), priors.Rollout(windows, valid), fit_key)
@@ -141,9 +142,7 @@ def main(run: Path, start: bool = False, last: bool = False, updates: int = 512,
     print(f"pool: {windows.shape[0] * windows.shape[1]} windows, mean forward speed {speed:.3f} m/s")
     print(table(ranking))
     path = out or opened.folder / ("ranking-start.json" if start else "ranking.json")
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps({"pool_speed": speed, "updates": updates, "windows": ranking}, indent=1) + "\n")
-    os.replace(partial, path)
+    runs.write(path, json.dumps({"pool_speed": speed, "updates": updates, "windows": ranking}, indent=1))
     print(f"wrote {path}")
 
 
@@ -151,4 +150,5 @@ if __name__ == "__main__":
     try:
         tyro.cli(main)
     except UserError as error:
-        raise SystemExit(f"fmpjax: {error}") from None
+        print(f"fmpjax: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -38,7 +38,7 @@ class Reward(NamedTuple):
 
 
 def median_reward(score: jax.Array, valid: jax.Array, spread_floor: float) -> Reward:
-    """R = 2 sigmoid((S - median) / max(IQR, floor)) over the rollout's valid windows (eq. reward), 0 elsewhere."""
+    """Reward 2 sigmoid((S - median) / max(IQR, floor)) over the rollout's valid windows (eq. reward), 0 elsewhere."""
     low, middle, high = jnp.nanquantile(jnp.where(valid, score, jnp.nan), jnp.array([0.25, 0.5, 0.75]))
     reward = 2.0 * jax.nn.sigmoid((score - middle) / jnp.maximum(high - low, spread_floor))
     return Reward(jnp.where(valid & jnp.isfinite(reward), reward, 0.0), middle, high - low)
