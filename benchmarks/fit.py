@@ -120,7 +120,8 @@ def main() -> None:
     rollout = priors.Rollout(features, jnp.ones(shape, bool))
 
     def scan(updates: int):
-        prior = priors.make("fmp", expert, float(dimension), dataclasses.replace(fitted, updates=updates))
+        changed = dataclasses.replace(settings, prior=dataclasses.replace(fitted, updates=updates))
+        prior = priors.make("fmp", trainer.expert._replace(bank=expert), changed)
         update, state = jax.jit(prior.update), prior.init(prior_key)
         return lambda: update(state, rollout, key)
 

@@ -237,8 +237,9 @@ class Env:
             ended > 0, 0.9 * state.capped_share + 0.1 * capped / jnp.maximum(ended, 1), state.capped_share
         )
         cap_age = state.cap_age + 1
-        grow = (share > config.cap_share) & (cap_age >= config.cap_patience) & (state.cap < config.episode_steps)
-        cap = jnp.where(grow, jnp.minimum(jnp.ceil(state.cap * config.cap_growth), config.episode_steps), state.cap)
+        last = min(config.last_cap, config.episode_steps)
+        grow = (share > config.cap_share) & (cap_age >= config.cap_patience) & (state.cap < last)
+        cap = jnp.where(grow, jnp.minimum(jnp.ceil(state.cap * config.cap_growth), last), state.cap)
         return state._replace(cap=cap, capped_share=share, cap_age=jnp.where(grow, 0, cap_age))
 
 

@@ -57,8 +57,14 @@ class Trainer:
         self.feature_map = features.fit_feature_map(self.robot, windows, config.features)
         self.expert_features = self.feature_map(windows)  # [W, D], every window of the demonstration
         bank = expert_bank_rows(jax.random.PRNGKey(config.seed), len(windows), config.prior.bank)
-        self.expert_bank = self.expert_features[bank]  # [m, D], E of the paper
-        self.prior = priors.make(config.method, self.expert_bank, float(self.feature_map.dimension), config.prior)
+        self.expert = priors.Expert(
+            bank=self.expert_features[bank],  # [m, D], E of the paper
+            windows=self.expert_features,
+            dimension=float(self.feature_map.dimension),
+            weight=jnp.tile(self.feature_map.weight, self.env.horizon),
+            horizon=self.env.horizon,
+        )
+        self.prior = priors.make(config.method, self.expert, config)
 
     def init(self) -> TrainState:
         """The state at iteration zero, a function of the configuration's seed."""

@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from fmpjax import potential, priors, transport
-from fmpjax.config import PriorConfig
+from fmpjax.config import Config, PriorConfig
 from fmpjax.errors import UserError
 from fmpjax.priors import Rollout, flow, median_reward
 
@@ -24,9 +24,17 @@ def rollout_of(points, valid=None):
     return Rollout(jnp.asarray(points, jnp.float32).reshape(STEPS, COUNT, -1), jnp.asarray(valid))
 
 
+def make(method, expert, config):
+    """A prior for an expert bank ``[m, D]`` of windows of one frame."""
+    bank = jnp.asarray(expert, jnp.float32)
+    size = bank.shape[-1]
+    weight = jnp.full(size, size**-0.5)
+    return priors.make(method, priors.Expert(bank, bank, float(size), weight, 1), Config(prior=config))
+
+
 @jax.jit
 def _learn(expert, rollout):
-    prior = priors.make("fmp", expert, 2.0, PROBE)
+    prior = make("fmp", expert, PROBE)
     return prior.update(prior.init(jax.random.PRNGKey(0)), rollout, jax.random.PRNGKey(1))
 
 
@@ -246,7 +254,7 @@ def test_removing_the_flow_loss_leaves_the_others(banks, taught, start):
 def tiny():
     """A small prior, its compiled update, and a rollout."""
     rng = np.random.default_rng(6)
-    prior = priors.make("fmp", jnp.asarray(rng.normal(size=(32, 3)) + 1, jnp.float32), 3.0, TINY)
+    prior = make("fmp", rng.normal(size=(32, 3)) + 1, TINY)
     points = rng.normal(size=(STEPS, COUNT, 3))
     state, _, _ = (update := jax.jit(prior.update))(
         prior.init(jax.random.PRNGKey(0)), rollout_of(points), jax.random.PRNGKey(9)
@@ -379,4 +387,4 @@ def test_invalid_and_nan_scores_get_nothing_and_move_nothing():
 
 def test_unknown_method():
     with pytest.raises(UserError, match="unknown method 'gail': expected one of"):
-        priors.make("gail", jnp.zeros((2, 2)), 2.0, PriorConfig())
+        make("gail", np.zeros((2, 2)), PriorConfig())

@@ -337,7 +337,7 @@ def test_seeds_decide_the_start(trainer):
     again, other = Trainer(tiny(), trainer.clip), Trainer(tiny(seed=1), trainer.clip)
     np.testing.assert_array_equal(flat(trainer.init()), flat(again.init()))
     assert np.any(flat(trainer.init()) != flat(other.init()))
-    assert np.any(np.asarray(trainer.expert_bank) != np.asarray(other.expert_bank))
+    assert np.any(np.asarray(trainer.expert.bank) != np.asarray(other.expert.bank))
 
 
 # --- evaluation ------------------------------------------------------------------------------------------------------

@@ -86,8 +86,9 @@ def rank(trainer: Trainer, windows: jax.Array, key: jax.Array, updates: int = 51
       By copy: mean reward, mean score above the pool's median in spreads of the pool (``margin``), and how often a
       random window of the demonstration scores above one of the copy's (``beaten``).
     """
-    config = dataclasses.replace(trainer.config.prior, updates=updates)
-    prior = priors.make(trainer.config.method, trainer.expert_bank, float(trainer.feature_map.dimension), config)
+    config = trainer.config.prior
+    changed = dataclasses.replace(trainer.config, prior=dataclasses.replace(config, updates=updates))
+    prior = priors.make(trainer.config.method, trainer.expert, changed)
     init_key, fit_key = jax.random.split(key)
     valid = jnp.ones(windows.shape[:2], bool)
     fit = jax.jit(prior.update)

@@ -1,20 +1,29 @@
 """Motion priors by name. Adding a method is one file here and one line in the registry."""
 
+from fmpjax.config import Config
 from fmpjax.errors import UserError
-from fmpjax.priors import flow
-from fmpjax.priors.base import MotionPrior, Reward, Rollout, median_reward
+from fmpjax.priors import amp, barycentric, empirical, flow
+from fmpjax.priors.base import Expert, MotionPrior, Reward, Rollout, median_reward
 
-_REGISTRY = {"fmp": flow.make}
+_REGISTRY = {
+    "fmp": flow.make,
+    "endpoint": flow.make_endpoint,
+    "value": flow.make_value,
+    "bank16": empirical.make,
+    "barycentric": barycentric.make,
+    "amp": amp.make,
+}
+METHODS = tuple(_REGISTRY)
 
 
-def make(method: str, expert_bank, dimension, config) -> MotionPrior:
-    """The prior called ``method``; see its module for the arguments.
+def make(method: str, expert: Expert, config: Config) -> MotionPrior:
+    """The prior called ``method``.
 
     Raises:
       UserError: unknown method.
     """
     check(method)
-    return _REGISTRY[method](expert_bank, dimension, config)
+    return _REGISTRY[method](expert, config)
 
 
 def check(method: str) -> None:
@@ -23,4 +32,4 @@ def check(method: str) -> None:
         raise UserError(f"unknown method {method!r}: expected one of {', '.join(_REGISTRY)}")
 
 
-__all__ = ["MotionPrior", "Reward", "Rollout", "check", "make", "median_reward"]
+__all__ = ["METHODS", "Expert", "MotionPrior", "Reward", "Rollout", "check", "make", "median_reward"]

@@ -17,6 +17,16 @@ class Rollout(NamedTuple):
     valid: jax.Array  # [T, N] bool, false where the state was not finite
 
 
+class Expert(NamedTuple):
+    """The demonstration as a prior sees it, in the fixed features."""
+
+    bank: jax.Array  # [m, D] fixed expert bank E
+    windows: jax.Array  # [W, D] every window
+    dimension: float  # d, coordinates of the full features that the D stand for
+    weight: jax.Array  # [D] feature of a standardised coordinate: root of its multiplicity over sqrt(d)
+    horizon: int  # frames in a window, oldest first, D / horizon coordinates each
+
+
 class MotionPrior(NamedTuple):
     """A learned reward.
 

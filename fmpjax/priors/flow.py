@@ -5,6 +5,7 @@ Adam step on three losses: the centred value of the score, its gradient, and the
 average of the rollout's parameters then scores every window.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -12,8 +13,8 @@ import jax.numpy as jnp
 import optax
 
 from fmpjax import potential, transport
-from fmpjax.config import PriorConfig
-from fmpjax.priors.base import MotionPrior, Rollout, median_reward
+from fmpjax.config import Config, PriorConfig
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, median_reward
 
 
 class FlowState(NamedTuple):
@@ -122,7 +123,23 @@ def losses(params, query, teacher: Teacher, flow: Flow, dimension, config: Prior
     return total, stats
 
 
-def make(expert_bank: jax.Array, dimension: float, config: PriorConfig) -> MotionPrior:
+def make(expert: Expert, config: Config) -> MotionPrior:
+    """FMP: all three losses."""
+    return _make(expert.bank, expert.dimension, config.prior)
+
+
+def make_endpoint(expert: Expert, config: Config) -> MotionPrior:
+    """Endpoint: FMP without the flow loss, everything else the same."""
+    return _make(expert.bank, expert.dimension, dataclasses.replace(config.prior, flow_weight=0.0))
+
+
+def make_value(expert: Expert, config: Config) -> MotionPrior:
+    """Value: FMP without the flow and the endpoint loss, everything else the same."""
+    changed = dataclasses.replace(config.prior, flow_weight=0.0, endpoint_weight=0.0)
+    return _make(expert.bank, expert.dimension, changed)
+
+
+def _make(expert_bank: jax.Array, dimension: float, config: PriorConfig) -> MotionPrior:
     """The prior for an expert bank ``[m, D]`` of features that stand for ``dimension`` coordinates."""
     optimizer = optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.adam(config.learning_rate))
     # Weight of the newest parameters such that an update's share halves after `average_half_life` updates.

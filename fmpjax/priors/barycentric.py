@@ -1,0 +1,100 @@
+"""Barycentric OT: distance to the mean of the matched expert successors (eq. bary of the paper).
+
+Histories are matched on all frames but the newest; the newest is rewarded for its closeness to the mean of the newest
+frames of the expert windows it was matched to. Fresh expert banks, no self term, nothing learned.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fmpjax import transport
+from fmpjax.config import Config, PriorConfig
+from fmpjax.priors.base import Expert, MotionPrior, Rollout
+
+
+class BarycentricState(NamedTuple):
+    """The expert bank of the last update, and its dual against the source bank."""
+
+    condition: jax.Array  # [m, C]
+    successor: jax.Array  # [m, F]
+    dual: jax.Array  # [m]
+    epsilon: jax.Array  # scalar
+
+
+def split(windows: jax.Array, horizon: int) -> tuple[jax.Array, jax.Array]:
+    """What is matched ``[n, (H - 1)(F - 2)]`` and what is scored ``[n, F]`` of features ``[n, H F]``.
+
+    The planar position of the preceding frames is left out: it is relative to the newest frame, and would tell where
+    that frame is.
+    """
+    frames = windows.reshape(len(windows), horizon, -1)
+    return frames[:, :-1, 2:].reshape(len(windows), -1), frames[:, -1]
+
+
+def match(source: jax.Array, condition: jax.Array, expert: Expert, config: PriorConfig):
+    """Dual ``[m]`` of an expert bank's conditions against a source bank's, and the entropy coefficient."""
+    cost = transport.squared_cost(source, condition)
+    epsilon = transport.entropy_coefficient(cost, expert.dimension, config.epsilon_fraction)
+    # The self problem is not used; a one-point one costs nothing.
+    solution = transport.solve(
+        cost,
+        jnp.zeros((1, 1)),
+        epsilon,
+        threshold=config.sinkhorn_threshold,
+        max_iterations=config.sinkhorn_iterations,
+    )
+    return solution.expert_dual, epsilon, solution
+
+
+def target(state: BarycentricState, condition: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Barycentric targets ``[n, F]`` of conditions ``[n, C]``, and the matching probabilities ``[n, m]``."""
+    cost = transport.squared_cost(condition, state.condition)
+    _, probability = transport.extension(cost, state.dual, state.epsilon)
+    return transport.barycentre(probability, state.successor), probability
+
+
+def make(expert: Expert, config: Config) -> MotionPrior:
+    """The barycentric baseline with temperature ``config.prior.temperature``."""
+    settings = config.prior
+    # Features are standardised coordinates times weight; d_g counts those of one full frame.
+    per_frame = expert.dimension / expert.horizon
+    scale = expert.dimension / (per_frame * settings.temperature)
+
+    def init(key):
+        condition, successor = split(expert.bank, expert.horizon)
+        return BarycentricState(condition, successor, jnp.zeros(len(condition)), jnp.float32(1.0))
+
+    def score(state: BarycentricState, x):
+        """The exponent, minus the squared distance over d_g T."""
+        condition, successor = split(x, expert.horizon)
+        goal, _ = target(state, condition)
+        return -scale * jnp.sum((successor - goal) ** 2, axis=-1)
+
+    def update(state: BarycentricState, rollout: Rollout, key):
+        steps, count, size = rollout.features.shape
+        pool = jnp.where(rollout.valid[..., None], rollout.features, expert.bank[0]).reshape(-1, size)
+        source_key, expert_key = jax.random.split(key)
+        source = pool[jax.random.randint(source_key, (settings.bank,), 0, len(pool))]
+        rows = jax.random.randint(expert_key, (settings.bank,), 0, len(expert.windows))
+        condition, successor = split(expert.windows[rows], expert.horizon)
+        dual, epsilon, solution = match(split(source, expert.horizon)[0], condition, expert, settings)
+        state = BarycentricState(condition, successor, dual, epsilon)
+        scores = score(state, pool)
+        reward = 2.0 * jnp.exp(scores).reshape(steps, count)
+        reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
+        _, probability = target(state, split(source, expert.horizon)[0])
+        low, middle, high = jnp.quantile(scores, np.array([0.25, 0.5, 0.75]))
+        summary = {
+            "score_median": middle,
+            "score_spread": high - low,
+            "effective_atoms": (1.0 / jnp.sum(probability**2, axis=-1)).mean(),
+            "epsilon": epsilon,
+            "sinkhorn_iterations": solution.iterations[0].astype(jnp.float32),
+            "unconverged": (~solution.converged[0]).astype(jnp.float32),
+        }
+        return state, reward, summary
+
+    return MotionPrior(init, update, score)

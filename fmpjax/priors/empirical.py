@@ -1,0 +1,79 @@
+"""16-bank score: the average of transport scores of fresh source banks, with no network (section IV-A of the paper).
+
+It tests what the neural potential adds: the reward is the teacher's own average, normalised as FMP's is.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from fmpjax import transport
+from fmpjax.config import Config
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, median_reward
+
+
+class EmpiricalState(NamedTuple):
+    """The source banks of the last rollout, solved."""
+
+    source: jax.Array  # [k, n, D]
+    self_dual: jax.Array  # [k, n]
+    expert_dual: jax.Array  # [k, m]
+    epsilon: jax.Array  # [k]
+
+
+def make(expert: Expert, config: Config) -> MotionPrior:
+    """The mean of ``config.prior.score_banks`` transport scores; nothing is learned."""
+    settings, bank = config.prior, expert.bank
+
+    def solve(source):
+        cross = transport.squared_cost(source, bank)
+        return transport.solve(
+            cross,
+            transport.squared_cost(source, source),
+            transport.entropy_coefficient(cross, expert.dimension, settings.epsilon_fraction),
+            threshold=settings.sinkhorn_threshold,
+            max_iterations=settings.sinkhorn_iterations,
+        )
+
+    def init(key):
+        # Banks of nothing but the demonstration: every score is the same.
+        source = jnp.broadcast_to(bank[:1], (settings.score_banks, settings.bank, bank.shape[-1]))
+        zeros = jnp.zeros((settings.score_banks, settings.bank))
+        return EmpiricalState(source, zeros, jnp.zeros((settings.score_banks, len(bank))), jnp.ones(len(zeros)))
+
+    def score(state: EmpiricalState, x):
+        to_expert = transport.squared_cost(x, bank)  # of every bank
+
+        def one(total, solved):
+            source, self_dual, expert_dual, epsilon = solved
+            expert_value, _ = transport.extension(to_expert, expert_dual, epsilon)
+            source_value, _ = transport.extension(transport.squared_cost(x, source), self_dual, epsilon)
+            return total + expert_value - source_value, None
+
+        total, _ = jax.lax.scan(one, jnp.zeros(x.shape[:1]), state)
+        return total / len(state.epsilon)
+
+    def update(state: EmpiricalState, rollout: Rollout, key):
+        steps, count, size = rollout.features.shape
+        pool = jnp.where(rollout.valid[..., None], rollout.features, bank[0]).reshape(-1, size)
+
+        def one(key):
+            source = pool[jax.random.randint(key, (settings.bank,), 0, len(pool))]
+            solution = solve(source)
+            return EmpiricalState(source, solution.self_dual, solution.expert_dual, solution.epsilon), solution
+
+        state, solutions = jax.lax.map(one, jax.random.split(key, settings.score_banks))
+        result = median_reward(score(state, pool).reshape(steps, count), rollout.valid, settings.spread_floor)
+        summary = {
+            "score_median": result.median,
+            "score_spread": result.spread,
+            "expert_margin": (score(state, bank).mean() - result.median)
+            / jnp.maximum(result.spread, settings.spread_floor),
+            "epsilon": solutions.epsilon.mean(),
+            "sinkhorn_iterations": solutions.iterations.max(-1).mean(),
+            "unconverged": (~solutions.converged).sum().astype(jnp.float32),
+        }
+        return state, result.reward, summary
+
+    return MotionPrior(init, update, score)
