@@ -1,0 +1,206 @@
+"""The matched comparison's results: Table I and the learning curves, the paper's figures beside ours."""
+
+import csv
+import dataclasses
+import json
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy import stats
+
+from fmpjax.experiments.cells import Cell
+from fmpjax.logs import MetricsLog
+
+TITLES = {
+    "fmp": "FMP",
+    "endpoint": "Endpoint",
+    "value": "Value",
+    "bank16": "16-bank score",
+    "amp": "AMP",
+    "barycentric": "Barycentric OT",
+}
+# Column, heading, digits.
+FIGURES = (
+    ("mean_length", "mean steps", 1),
+    ("falls", "falls, %", 1),
+    ("late_speed", "speed, m/s", 3),
+    ("excursion", "excursion", 3),
+    ("amplitude_mae", "amp. MAE, °", 2),
+    ("sinkhorn", "Sinkhorn", 3),
+)
+# The paper's Table I: 50 M transitions, 1,024 episodes; falls as a share of them.
+_PAPER = {
+    ("dataset", "fmp"): (500.0, 0, 0.727, 1.119, 9.95, 0.159),
+    ("dataset", "endpoint"): (500.0, 0, 0.571, 0.997, 9.44, 0.158),
+    ("dataset", "value"): (500.0, 0, 0.776, 1.089, 8.69, 0.186),
+    ("dataset", "bank16"): (500.0, 0, 0.518, 0.891, 9.25, 0.196),
+    ("dataset", "amp"): (498.8, 3, 0.478, 1.035, 9.37, 0.239),
+    ("dataset", "barycentric"): (499.3, 3, 0.000, 0.025, 38.44, 0.347),
+    ("fixed", "fmp"): (469.4, 129, 0.338, 0.754, 12.60, 0.285),
+    ("fixed", "endpoint"): (453.8, 243, 0.147, 0.703, 13.38, 0.285),
+    ("fixed", "value"): (451.6, 315, 0.047, 0.387, 25.23, 0.308),
+    ("fixed", "bank16"): (466.7, 196, -0.021, 0.667, 14.27, 0.526),
+    ("fixed", "amp"): (500.0, 0, 0.000, 0.027, 39.24, 0.424),
+    ("fixed", "barycentric"): (500.0, 0, 0.000, 0.144, 35.15, 0.557),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One evaluation of one cell; figures that are not defined are NaN."""
+
+    cell: str
+    method: str
+    reset: str
+    variant: str
+    seed: int
+    transitions: int
+    seconds: float  # of training
+    figures: dict[str, float]
+
+
+def evaluations(cell: Cell, folder: Path) -> list[Row]:
+    """All evaluations of a cell's run, in their order; falls in per cent of the episodes."""
+    rows = []
+    for line in MetricsLog.read(folder / cell.name / "metrics.csv"):
+        if not line.get("eval/quality"):
+            continue
+        figures = {k.removeprefix("eval/"): float(v or "nan") for k, v in line.items() if k.startswith("eval/")}
+        figures["falls"] *= 100.0 / figures["episodes"]
+        config = cell.config
+        rows.append(
+            Row(
+                cell.name, config.method, config.env.reset, cell.variant, config.seed,
+                int(line["transitions"]), float(line["seconds"]), figures,
+            )
+        )  # fmt: skip
+    return rows
+
+
+def interval(values: Iterable[float]) -> tuple[float, float]:
+    """Mean of the finite values, and half the width of its 95 % interval over seeds (Student's t; NaN below two)."""
+    finite = np.array([v for v in values if math.isfinite(v)])
+    if not len(finite):
+        return math.nan, math.nan
+    if len(finite) == 1:
+        return float(finite[0]), math.nan
+    half = stats.t.ppf(0.975, len(finite) - 1) * finite.std(ddof=1) / math.sqrt(len(finite))
+    return float(finite.mean()), float(half)
+
+
+def _groups(final: Sequence[Row]) -> dict[tuple[str, str, str], list[Row]]:
+    groups: dict[tuple[str, str, str], list[Row]] = {}
+    for row in final:
+        groups.setdefault((row.reset, row.method, row.variant), []).append(row)
+    return groups
+
+
+def _number(value: float, digits: int, half: float = math.nan) -> str:
+    if math.isnan(value):
+        return "–"
+    return f"{value:.{digits}f}" + ("" if math.isnan(half) else f" ± {half:.{digits}f}")
+
+
+def _paper(reset: str, method: str) -> list[float]:
+    length, falls, *rest = _PAPER[reset, method]
+    return [length, 100.0 * falls / 1024, *rest]
+
+
+def _lines(final: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
+    headings = ["reset", "method", "seeds", *(heading for _, heading, _ in FIGURES), "training, min"]
+    lines = []
+    for (reset, method, variant), rows in _groups(final).items():
+        ours = [_number(*_ordered(interval(r.figures[k] for r in rows), digits)) for k, _, digits in FIGURES]
+        minutes = np.mean([r.seconds for r in rows]) / 60
+        name = TITLES.get(method, method) + (f", {variant}" if variant else "")
+        lines.append([reset, name, str(len(rows)), *ours, f"{minutes:.0f}"])
+        if not variant:
+            theirs = [_number(v, d) for v, (_, _, d) in zip(_paper(reset, method), FIGURES, strict=True)]
+            lines.append([reset, f"{name}, the paper's", "1", *theirs, ""])
+    return headings, lines
+
+
+def _ordered(pair: tuple[float, float], digits: int) -> tuple[float, int, float]:
+    return pair[0], digits, pair[1]
+
+
+def markdown(final: Sequence[Row]) -> str:
+    """Table I in Markdown."""
+    headings, lines = _lines(final)
+    rule = ["---", "---", *["---:"] * (len(headings) - 2)]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (headings, rule, *lines))
+
+
+def latex(final: Sequence[Row]) -> str:
+    """Table I in LaTeX (booktabs)."""
+    headings, lines = _lines(final)
+
+    def line(cells):
+        escaped = (
+            c.replace("%", r"\%").replace("°", r"$^\circ$").replace("±", r"$\pm$").replace("–", "--") for c in cells
+        )
+        return " & ".join(escaped) + r" \\"
+
+    body = [line(headings), r"\midrule", *map(line, lines)]
+    columns = "ll" + "r" * (len(headings) - 2)
+    return "\n".join([rf"\begin{{tabular}}{{{columns}}}", r"\toprule", *body, r"\bottomrule", r"\end{tabular}"])
+
+
+def curves(rows: Sequence[Row], paths: Sequence[Path]) -> None:
+    """Late speed, excursion and falls over the budget: a row of panels for each reset, a colour for each method.
+
+    Thick lines are means over seeds, thin ones single seeds.
+    """
+    resets = list(dict.fromkeys(row.reset for row in rows))
+    labels = list(dict.fromkeys((row.method, row.variant) for row in rows))
+    panels = (("late_speed", "late speed, m/s"), ("excursion", "excursion"), ("falls", "falls, %"))
+    figure = Figure((10.5, 2.9 * len(resets) + 0.5), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(resets), len(panels), squeeze=False, sharex=True)
+    handles = {}
+    for line, reset in zip(grid, resets, strict=True):
+        for panel, (key, title) in zip(line, panels, strict=True):
+            for index, (method, variant) in enumerate(labels):
+                chosen = [r for r in rows if (r.reset, r.method, r.variant) == (reset, method, variant)]
+                name = TITLES.get(method, method) + (f", {variant}" if variant else "")
+                for seed in sorted({r.seed for r in chosen}):
+                    mine = [r for r in chosen if r.seed == seed]
+                    panel.plot(
+                        [r.transitions / 1e6 for r in mine], [r.figures[key] for r in mine],
+                        color=f"C{index}", linewidth=0.7, alpha=0.5,
+                    )  # fmt: skip
+                stops = sorted({r.transitions for r in chosen})
+                means = [interval(r.figures[key] for r in chosen if r.transitions == stop)[0] for stop in stops]
+                (handles[name],) = panel.plot(
+                    np.array(stops) / 1e6, means, color=f"C{index}", linewidth=1.8, marker="o", markersize=3
+                )
+            panel.set_title(f"{reset} reset: {title}", fontsize=9, loc="left")
+            panel.tick_params(labelsize=7, length=2)
+            panel.grid(alpha=0.25, linewidth=0.5)
+            panel.spines[["top", "right"]].set_visible(False)
+    for panel in grid[-1]:
+        panel.set_xlabel("million transitions", fontsize=8)
+    figure.legend(handles.values(), handles, loc="outside upper center", ncols=6, fontsize=8, frameon=False)
+    for path in paths:
+        figure.savefig(path)
+
+
+def write(cells: Sequence[Cell], folder: Path, provenance: dict[str, object]) -> list[Path]:
+    """Tables and curves of the cells' runs in ``folder``; the paths written."""
+    rows = [row for cell in cells for row in evaluations(cell, folder)]
+    final = [rows_of[-1] for cell in cells if (rows_of := [r for r in rows if r.cell == cell.name])]
+    flat = [{k: v for k, v in dataclasses.asdict(r).items() if k != "figures"} | r.figures for r in rows]
+    with (folder / "results.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, flat[0])
+        writer.writeheader()
+        writer.writerows({k: "" if v != v else v for k, v in line.items()} for line in flat)
+    lines = [{k: None if v != v else v for k, v in line.items()} for line in flat]
+    (folder / "results.json").write_text(json.dumps({"provenance": provenance, "evaluations": lines}, indent=1) + "\n")
+    (folder / "table.md").write_text(markdown(final) + "\n")
+    (folder / "table.tex").write_text(latex(final) + "\n")
+    curves(rows, [folder / "curves.png", folder / "curves.pdf"])
+    return [folder / n for n in ("results.csv", "results.json", "table.md", "table.tex", "curves.png", "curves.pdf")]

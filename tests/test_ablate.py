@@ -1,0 +1,189 @@
+"""The matched comparison: plans, cells that go on after a kill, tables from their runs."""
+
+import json
+import math
+import re
+
+import pytest
+
+from fmpjax import config as configuration
+from fmpjax import priors
+from fmpjax.errors import UserError
+from fmpjax.experiments import ablate, cells, table
+
+TINY = {
+    "env.count": 4, "transitions": 4 * 32 * 2, "chunk": 1, "evaluation_episodes": 4, "env.episode_steps": 20,
+    "env.last_cap": 20, "env.first_cap": 20, "evaluations": [0.5, 1.0],
+}  # fmt: skip
+
+
+def specification(path, text):
+    path.write_text(text)
+    return cells.read_specification(path)
+
+
+# --- plans -----------------------------------------------------------------------------------------------------------
+
+
+def test_plan_is_every_method_reset_and_seed():
+    planned = cells.plan(cells.Specification(preset="smoke", seeds=(0, 7)))
+    assert len(planned) == 6 * 2 * 2
+    assert len({cell.name for cell in planned}) == len(planned)
+    assert {(c.config.method, c.config.env.reset, c.config.seed) for c in planned} == {
+        (m, r, s) for m in priors.METHODS for r in ("dataset", "fixed") for s in (0, 7)
+    }
+    # Nothing else differs between two cells.
+    a, b = (configuration.flatten(c.config) for c in planned[:2])
+    assert {k for k in a if a[k] != b[k]} == {"seed"}
+
+
+def test_plan_from_a_file(tmp_path):
+    spec = specification(
+        tmp_path / "plan.toml",
+        'preset = "smoke"\nmethods = ["fmp"]\nresets = ["dataset"]\nseeds = [0, 1]\n'
+        '[settings]\n"ppo.discount" = 0.9\n[variants.short]\n"env.first_cap" = 32\n[variants.long]\n',
+    )
+    planned = cells.plan(spec)
+    assert [c.name for c in planned] == [
+        "fmp-dataset-short-0", "fmp-dataset-short-1", "fmp-dataset-long-0", "fmp-dataset-long-1",
+    ]  # fmt: skip
+    assert [c.config.env.first_cap for c in planned] == [32, 32, 64, 64]
+    assert {c.config.ppo.discount for c in planned} == {0.9}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("sedes = [1]", "plan.toml: unknown key 'sedes', expected one of preset, motion"),
+        ('seeds = "0"', "plan.toml: seeds is '0', expected a list of whole numbers"),
+        ("seeds = [true]", "expected a list of whole numbers"),
+        ("seeds = []", "expected a list of whole numbers"),
+        ("methods = [1]", "expected a list of names"),
+        ("transitions = 1.5", "transitions is 1.5, expected a whole number"),
+        ("variants = 3", "expected tables of"),
+        ("preset = ", "plan.toml is not valid TOML"),
+    ],
+)
+def test_bad_specification(tmp_path, text, message):
+    with pytest.raises(UserError, match=re.escape(message)):
+        specification(tmp_path / "plan.toml", text)
+
+
+def test_missing_specification_and_unknown_names(tmp_path):
+    with pytest.raises(UserError, match="cannot read .*none.toml: No such file"):
+        cells.read_specification(tmp_path / "none.toml")
+    with pytest.raises(UserError, match="unknown method 'gail'"):
+        cells.plan(cells.Specification(methods=("gail",)))
+    with pytest.raises(UserError, match="unknown reset 'random'"):
+        cells.plan(cells.Specification(resets=("random",)))
+    with pytest.raises(UserError, match=r"unknown setting 'ppo.gamma'"):
+        cells.plan(cells.Specification(settings={"ppo.gamma": 0.9}))
+
+
+def test_errors_exit_with_code_two(tmp_path, capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        ablate.cli(["--out", str(tmp_path), "--methods", "gail"])
+    assert exit_info.value.code == 2
+    assert capsys.readouterr().err == f"ablate: unknown method 'gail': expected one of {', '.join(priors.METHODS)}\n"
+    with pytest.raises(UserError, match="--workers is 0: expected at least 1"):
+        cells.run(cells.plan(cells.Specification(preset="smoke", methods=("fmp",))), tmp_path, workers=0)
+
+
+# --- cells -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ablated(tmp_path_factory):
+    """Two tiny cells, run at once, and what `ablate` wrote of them."""
+    folder = tmp_path_factory.mktemp("ablate")
+    settings = "\n".join(f'"{key}" = {json.dumps(value)}' for key, value in TINY.items())
+    (folder / "plan.toml").write_text(
+        f'preset = "smoke"\nmethods = ["fmp", "barycentric"]\nresets = ["fixed"]\n[settings]\n{settings}\n'
+    )
+    ablate.cli(["--spec", str(folder / "plan.toml"), "--out", str(folder / "out"), "--workers", "2"])
+    return folder, cells.plan(cells.read_specification(folder / "plan.toml"))
+
+
+@pytest.mark.slow
+def test_ablate_writes_tables_and_curves(ablated):
+    folder, planned = ablated
+    names = ("results.csv", "results.json", "table.md", "table.tex", "curves.png", "curves.pdf")
+    assert all((folder / "out" / name).stat().st_size > 0 for name in names)
+    assert all(cells.finished(cell, folder / "out") for cell in planned)
+    results = json.loads((folder / "out" / "results.json").read_text())
+    assert [(e["cell"], e["transitions"]) for e in results["evaluations"]] == [
+        ("fmp-fixed-0", 128), ("fmp-fixed-0", 256), ("barycentric-fixed-0", 128), ("barycentric-fixed-0", 256),
+    ]  # fmt: skip
+    assert results["provenance"]["python"]
+    rows = table.evaluations(planned[0], folder / "out")
+    saved = json.loads((folder / "out" / "fmp-fixed-0" / "config.json").read_text())
+    assert (rows[-1].method, rows[-1].reset, rows[-1].seed) == ("fmp", "fixed", saved["seed"])
+
+
+@pytest.mark.slow
+def test_finished_cells_are_left_alone_and_unfinished_ones_go_on(ablated, capsys):
+    """A cell cut back to half its course, as a kill would leave it, is finished; the other is not touched."""
+    folder, planned = ablated
+    out = folder / "out"
+    stamp = (out / "barycentric-fixed-0" / "metrics.csv").stat().st_mtime_ns
+    (out / "fmp-fixed-0" / "evaluation.json").unlink()
+    assert not cells.finished(planned[0], out)
+    cells.run(planned, out)
+    assert cells.finished(planned[0], out)
+    assert (out / "barycentric-fixed-0" / "metrics.csv").stat().st_mtime_ns == stamp
+    assert "2 cells, 1 of them finished before" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_results_of_another_configuration_are_refused(ablated):
+    folder, _ = ablated
+    other = cells.plan(
+        cells.Specification(preset="smoke", methods=("fmp",), resets=("fixed",), settings=TINY | {"ppo.discount": 0.5})
+    )
+    with pytest.raises(UserError, match=r"fmp-fixed-0 holds a run with ppo.discount 0.97, not 0.5: name another --out"):
+        cells.run(other, folder / "out")
+
+
+@pytest.mark.slow
+def test_a_cell_that_fails_is_named_after_the_others_ran(tmp_path):
+    changes = TINY | {"motion": str(tmp_path / "none.npz")}
+    bad = cells.plan(cells.Specification(preset="smoke", methods=("fmp",), resets=("fixed",), settings=changes))
+    with pytest.raises(UserError, match=r"1 of 1 cells failed: see .*fmp-fixed-0.log \(fmp-fixed-0\)"):
+        cells.run(bad, tmp_path / "out")
+    assert "none.npz" in (tmp_path / "out" / "fmp-fixed-0.log").read_text()
+
+
+# --- tables ----------------------------------------------------------------------------------------------------------
+
+
+def row(method, seed, speed, reset="dataset", variant=""):
+    figures = {"mean_length": 490.0, "falls": 5.0, "late_speed": speed, "excursion": 1.0, "amplitude_mae": 9.0,
+               "sinkhorn": 0.2}  # fmt: skip
+    return table.Row(f"{method}-{reset}-{seed}", method, reset, variant, seed, 1000, 60.0, figures)
+
+
+def test_interval_is_student_s():
+    """Of 0.6, 0.7, 0.8: mean 0.7, deviation 0.1, t(2) = 4.3027, half width 4.3027 * 0.1 / sqrt 3 = 0.2484."""
+    mean, half = table.interval([0.6, 0.7, 0.8, math.nan])
+    assert mean == pytest.approx(0.7)
+    assert half == pytest.approx(0.24841, rel=1e-4)
+    assert math.isnan(table.interval([0.6])[1])
+    assert math.isnan(table.interval([math.nan])[0])
+
+
+def test_table_has_the_paper_beside_ours():
+    lines = table.markdown([row("fmp", 0, 0.6), row("fmp", 1, 0.7), row("amp", 0, math.nan)]).splitlines()
+    assert len(lines) == 2 + 4
+    assert lines[2].startswith("| dataset | FMP | 2 | 490.0 ± 0.0 | 5.0 ± 0.0 | 0.650 ± 0.635 |")
+    assert lines[3].startswith("| dataset | FMP, the paper's | 1 | 500.0 | 0.0 | 0.727 | 1.119 | 9.95 | 0.159 |")
+    assert lines[4].startswith("| dataset | AMP | 1 | 490.0 | 5.0 | – |")
+    assert len({line.count("|") for line in lines}) == 1
+    latex = table.latex([row("fmp", 0, 0.6)])
+    assert latex.count(r"\\") == 3
+    assert r"0.600" in latex
+    assert "%" not in latex.replace(r"\%", "")
+
+
+def test_variants_have_rows_of_their_own():
+    lines = table.markdown([row("fmp", 0, 0.6, variant="short"), row("fmp", 0, 0.7, variant="long")]).splitlines()
+    assert [line.split("|")[2].strip() for line in lines[2:]] == ["FMP, short", "FMP, long"]
