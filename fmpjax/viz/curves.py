@@ -1,11 +1,13 @@
-"""Learning curves of a run, from its ``metrics.csv``."""
+"""Learning curves, from the tables that runs and experiments write."""
 
 import csv
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from fmpjax.errors import UserError
 
@@ -61,6 +63,53 @@ def learning_curves(csv_path: str | Path, png_path: str | Path) -> Path:
         lowest = panels[(len(names) - 1 - column) // columns, column]
         lowest.set_xlabel(label, fontsize=8)
         lowest.tick_params(labelbottom=True)
+    try:
+        png_path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(png_path, format="png")
+    except OSError as error:
+        raise UserError(f"cannot write {png_path}: {error.strerror or error}") from error
+    return png_path
+
+
+def comparison(
+    png_path: str | Path, tables: Mapping[str, str | Path], panels: Mapping[str, Sequence[str]], columns: int = 4
+) -> Path:
+    """Draw columns of several tables over their transitions, a colour for each table; returns the PNG's path.
+
+    Args:
+      png_path: picture to write.
+      tables: CSV file of each label.
+      panels: columns to draw in the panel of each title; the first is solid, the second dashed, the third dotted.
+      columns: panels in a row.
+
+    Raises:
+      UserError: a table cannot be read, or the picture cannot be written.
+    """
+    png_path = Path(png_path)
+    read = {label: _read(Path(path)) for label, path in tables.items()}
+    rows = -(-len(panels) // columns)
+    figure = Figure((3.2 * columns, 2.3 * rows + 0.4), dpi=90, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for panel, (title, names) in zip(grid.flat, panels.items(), strict=False):
+        for index, table in enumerate(read.values()):
+            across, label = _horizontal(table)
+            for name, style in zip(names, ("-", "--", ":"), strict=False):
+                if name not in table:
+                    continue
+                known = np.isfinite(table[name])
+                marker = "o" if known.mean() < SPARSE or known.sum() < 30 else ""
+                panel.plot(across[known], table[name][known], style, color=f"C{index}", linewidth=1.3, marker=marker,
+                           markersize=2.5)  # fmt: skip
+            panel.set_xlabel(label, fontsize=8)
+        panel.set_title(title, fontsize=9, loc="left")
+        panel.tick_params(labelsize=7, length=2)
+        panel.grid(alpha=0.25, linewidth=0.5)
+        panel.spines[["top", "right"]].set_visible(False)
+    for panel in grid.flat[len(panels) :]:
+        panel.set_visible(False)
+    handles = [Line2D([], [], color=f"C{index}", label=label) for index, label in enumerate(read)]
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(6, len(handles)), fontsize=8, frameon=False)
     try:
         png_path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(png_path, format="png")

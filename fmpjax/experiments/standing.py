@@ -1,0 +1,367 @@
+"""Why a policy stands before it walks: what the fitted reward pays for, measured along a training run.
+
+A policy is trained as `fmpjax train` would, and every so often it is halted and looked at: what its standing and its
+walking moments earn and how soon they end in a fall, how much of the policy gradient is about survival alone, how well
+the few updates of a rollout follow the transport they are fitted to, and which features carry the score. Run as
+``python -m fmpjax.experiments.standing measure --out FOLDER``.
+"""
+
+import csv
+import dataclasses
+import json
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from fmpjax import features, physics, potential, ppo, priors, runs, transport
+from fmpjax.config import Config, preset
+from fmpjax.errors import UserError
+from fmpjax.evaluate import Evaluator
+from fmpjax.priors.base import median_reward
+from fmpjax.robots import Robot
+from fmpjax.train import Trainer, TrainState
+from fmpjax.viz import curves
+
+STANDING, WALKING = 0.15, 0.40  # m/s, mean forward speed of a window below or above which it counts as such
+HAZARD_STEPS = 50  # control steps in which a fall is looked for
+ROLLOUTS = 8  # rollouts of one measurement, one after another
+PUSH = 0.1  # m/s
+QUERIES, BANKS = 512, 16  # windows and source banks of the transport reference
+
+_PANELS = {
+    "share: standing (solid), walking": ("standing_share", "walking_share"),
+    "mean reward: standing, walking": ("standing_reward", "walking_reward"),
+    "falls within 1 s: standing, walking": ("standing_falls_in_1s", "walking_falls_in_1s"),
+    "return at 0.97: standing, walking": ("standing_return_0.97", "walking_return_0.97"),
+    "return explained by survival": ("return_survival_share",),
+    "agreement of two gradients": ("gradient_agreement", "gradient_survival_cosine"),
+    "correlation: 3 updates, 128": ("online_correlation", "128_updates_correlation"),
+    "gain of a 0.1 m/s push, spreads": ("standing_push_gain",),
+}
+
+
+class Moments(NamedTuple):
+    """Consecutive rollouts of one frozen policy, ``[T, N, ...]`` with T = rollouts * steps."""
+
+    windows: jax.Array  # [T, N, D] features
+    pushed: jax.Array  # [T, N, D] the same windows, ``PUSH`` faster forward throughout
+    speed: jax.Array  # [T, N] m/s, mean forward speed of the window
+    reward: jax.Array  # [T, N] under the frozen prior
+    survival: jax.Array  # [T, N] the reward of somebody who only survives: its mean
+    batch: ppo.Batch
+
+
+def gather(trainer: Trainer, state: TrainState, key: jax.Array) -> Moments:
+    """Play the policy of ``state`` on, and score what it does with the prior of ``state``."""
+    env, steps = trainer.env, trainer.config.ppo.rollout_steps
+    forward = features.velocity_index(trainer.robot)
+    lag = jnp.arange(1 - env.horizon, 1)[:, None] / trainer.config.control_rate  # s before the newest frame
+
+    def play(env_state, key):
+        after, record = env.rollout(env_state, trainer.ppo.act(state.ppo), key, steps)
+        frames = env.frame_table(env_state, record)[record.window]
+        # A faster window also comes from further back.
+        faster = frames.at[..., forward].add(PUSH).at[..., :1].add(PUSH * lag)
+        windows = trainer.feature_map(frames), trainer.feature_map(faster)
+        return after._replace(cap=env_state.cap), (*windows, frames[..., forward].mean(-1), record)
+
+    _, (windows, pushed, speed, record) = jax.lax.scan(play, state.env, jax.random.split(key, ROLLOUTS))
+    windows, pushed, speed, record = jax.tree.map(
+        lambda x: x.reshape(-1, *x.shape[2:]), (windows, pushed, speed, record)
+    )
+    score = trainer.prior.score(state.prior, windows.reshape(-1, windows.shape[-1])).reshape(speed.shape)
+    reward = median_reward(score, ~record.nonfinite, trainer.config.prior.spread_floor).reward
+    batch = ppo.Batch(
+        record.observation, record.next_observation, record.action, record.extras["mean"], record.extras["deviation"],
+        reward, record.fell, record.timed_out,
+    )  # fmt: skip
+    return Moments(windows, pushed, speed, reward, jnp.full_like(reward, reward.mean()), batch)
+
+
+def behaviours(moments: Moments, discounts=(0.97, 0.99)) -> dict[str, float]:
+    """Share, mean reward, fall hazard and resulting return of the standing and of the walking moments."""
+    speed, reward = np.asarray(moments.speed), np.asarray(moments.reward)
+    fell, cut = np.asarray(moments.batch.fell), np.asarray(moments.batch.timed_out)
+    total = len(speed) - HAZARD_STEPS
+    falls = np.lib.stride_tricks.sliding_window_view(fell, HAZARD_STEPS, 0)[1 : total + 1]
+    cuts = np.lib.stride_tricks.sliding_window_view(cut, HAZARD_STEPS, 0)[1 : total + 1]
+    first_fall = np.where(falls.any(-1), falls.argmax(-1), HAZARD_STEPS)
+    first_cut = np.where(cuts.any(-1), cuts.argmax(-1), HAZARD_STEPS)
+    # Moments that a time-out cuts short say nothing of what would have come.
+    known = (first_cut >= np.minimum(first_fall, HAZARD_STEPS)) & ~(fell | cut)[:total]
+    falling = first_fall < np.minimum(first_cut, HAZARD_STEPS)
+    row = {}
+    for name, chosen in (("standing", np.abs(speed) < STANDING), ("walking", speed > WALKING)):
+        sample = chosen[:total] & known
+        within = falling[sample].mean() if sample.sum() >= 100 else np.nan
+        hazard = 1.0 - (1.0 - min(within, 1.0 - 1e-6)) ** (1.0 / HAZARD_STEPS)
+        row[f"{name}_share"] = chosen.mean()
+        row[f"{name}_reward"] = reward[chosen].mean() if chosen.sum() >= 100 else np.nan
+        row[f"{name}_falls_in_1s"] = within
+        for discount in discounts:
+            # Of somebody who goes on so for ever: reward each step, a fall ends it.
+            row[f"{name}_return_{discount}"] = row[f"{name}_reward"] / (1.0 - discount * (1.0 - hazard))
+    return {name: float(value) for name, value in row.items()}
+
+
+def _returns(reward, batch: ppo.Batch, discount: float):
+    """Discounted returns ``[T, N]``; time-outs and the last step go on at the mean reward for ever."""
+    value = jnp.full_like(reward, reward.mean() / (1.0 - discount))
+    return ppo.generalized_advantage(reward, value, value, batch.fell, batch.timed_out, discount, 1.0) + value
+
+
+def gradients(trainer: Trainer, state: TrainState, moments: Moments) -> dict[str, jax.Array]:
+    """Signal to noise of the policy gradient, and how much of it mere survival explains."""
+    config = trainer.config.ppo
+    value = trainer.ppo.value(state.ppo, moments.batch.observation)
+    next_value = trainer.ppo.value(state.ppo, moments.batch.next_observation)
+    center = moments.survival.mean() / (1.0 - config.discount)
+
+    def gradient(advantage, batch):
+        gain = (advantage - advantage.mean()) / advantage.std()
+
+        def surrogate(actor):
+            mean, deviation = trainer.ppo.policy(actor, state.ppo.normalizer, batch.observation)
+            log_probability = -0.5 * ((batch.action - mean) / deviation) ** 2 - jnp.log(deviation)
+            return jnp.mean(jnp.clip(gain, -4, 4) * log_probability.sum(-1))
+
+        return jax.flatten_util.ravel_pytree(jax.grad(surrogate)(state.ppo.actor))[0]
+
+    def per_rollout(reward, value, next_value):
+        split = jax.tree.map(
+            lambda x: x.reshape(ROLLOUTS, -1, *x.shape[1:]), (moments.batch, reward, value, next_value)
+        )
+
+        def one(item):
+            batch, reward, value, next_value = item
+            advantage = ppo.generalized_advantage(
+                reward, value, next_value, batch.fell, batch.timed_out, config.discount, config.gae_lambda
+            )
+            return gradient(advantage, batch)
+
+        return jax.lax.map(one, split)
+
+    learned = per_rollout(moments.reward, value, next_value)
+    flat = jnp.full_like(value, center)
+    survival = per_rollout(moments.survival, flat, flat)
+
+    def agreement(a):
+        unit = a / jnp.linalg.norm(a, axis=-1, keepdims=True)
+        pairs = unit @ unit.T
+        return (pairs.sum() - len(a)) / (len(a) * (len(a) - 1))
+
+    a, b = learned.mean(0), survival.mean(0)
+    G, L = (_returns(reward, moments.batch, config.discount).ravel() for reward in (moments.reward, moments.survival))
+    return {
+        "gradient_agreement": agreement(learned),  # cosine of the gradients of two independent rollouts
+        "gradient_survival_cosine": a @ b / (jnp.linalg.norm(a) * jnp.linalg.norm(b)),
+        "return_survival_share": jnp.corrcoef(G, L)[0, 1] ** 2,
+        "critic_explained_variance": 1.0 - jnp.var(G - value.ravel()) / jnp.var(G),
+    }
+
+
+def _groups(robot: Robot) -> dict[str, int]:
+    """Sizes of the quantities in a compact frame, in their order."""
+    joints = robot.joint_count
+    return {
+        "root_position": 3, "root_rotation": 6, "joint_angles": 2 * joints, "key_points": 3 * len(robot.key_body),
+        "root_velocity": 3, "root_angular_velocity": 3, "joint_velocity": joints,
+    }  # fmt: skip
+
+
+class Reference(NamedTuple):
+    """Transport score averaged over independent source banks."""
+
+    score: jax.Array  # [q] centred
+    gradient: jax.Array  # [q, D]
+
+
+def reference(pool: jax.Array, expert: jax.Array, query: jax.Array, trainer: Trainer, key: jax.Array) -> Reference:
+    """Mean transport score of ``BANKS`` source banks of ``pool [n, D]`` at ``query [q, D]``."""
+    config, dimension = trainer.config.prior, trainer.feature_map.dimension
+
+    def one(key):
+        source = pool[jax.random.randint(key, (config.bank,), 0, len(pool))]
+        cross = transport.squared_cost(source, expert)
+        epsilon = transport.entropy_coefficient(cross, dimension, config.epsilon_fraction)
+        fitted = transport.fit_score(source, expert, epsilon=epsilon, threshold=1e-4, max_iterations=1000)
+        score = fitted.score(query)
+        return score - score.mean(), fitted.gradient(query)
+
+    score, gradient = jax.lax.map(one, jax.random.split(key, BANKS))
+    return Reference(score.mean(0), gradient.mean(0))
+
+
+def fits(trainer: Trainer, state: TrainState, moments: Moments, key: jax.Array) -> dict[str, jax.Array]:
+    """How the fitted potential, and one fitted 128 times more to the same windows, follow the transport."""
+    config, dimension = trainer.config.prior, trainer.feature_map.dimension
+    pool = moments.windows.reshape(-1, moments.windows.shape[-1])
+    pick_key, bank_key, fit_key = jax.random.split(key, 3)
+    query = pool[jax.random.randint(pick_key, (QUERIES,), 0, len(pool))]
+    truth = reference(pool, trainer.expert.bank, query, trainer, bank_key)
+    low, high = jnp.quantile(truth.score, jnp.array([0.25, 0.75]))
+    spread = jnp.maximum(high - low, config.spread_floor)
+    longer = dataclasses.replace(trainer.config, prior=dataclasses.replace(config, updates=128))
+    longer = priors.make(trainer.config.method, trainer.expert, longer)
+    rollout = priors.Rollout(moments.windows, jnp.ones(moments.speed.shape, bool))
+    refitted = longer.update(state.prior, rollout, fit_key)[0]
+    row = {"score_spread": spread}
+    for name, prior in (("online", state.prior), ("128_updates", refitted)):
+        score, gradient = potential.score_and_gradient(prior.average, query, dimension)
+        score = score - score.mean()
+        cosine = jnp.sum(gradient * truth.gradient, -1) / jnp.maximum(
+            jnp.linalg.norm(gradient, axis=-1) * jnp.linalg.norm(truth.gradient, axis=-1), 1e-12
+        )
+        row[f"{name}_correlation"] = jnp.corrcoef(score, truth.score)[0, 1]
+        row[f"{name}_error"] = jnp.abs(score - truth.score).mean() / spread
+        row[f"{name}_gradient_cosine"] = cosine.mean()
+    score = trainer.prior.score(state.prior, pool)
+    spread = jnp.subtract(*jnp.quantile(score, jnp.array([0.75, 0.25])))
+    gain = trainer.prior.score(state.prior, moments.pushed.reshape(pool.shape)) - score
+    standing = jnp.abs(moments.speed.ravel()) < STANDING
+    # What the reward's argument gains, in its own units, if a standing window were PUSH faster.
+    row["standing_push_gain"] = jnp.where(standing, gain, 0.0).sum() / jnp.maximum(standing.sum(), 1) / spread
+    weight = truth.gradient**2
+    frame = weight.reshape(len(query), trainer.env.horizon, -1)
+    start = 0
+    for name, size in _groups(trainer.robot).items():
+        row[f"gradient_share_{name}"] = frame[..., start : start + size].sum() / weight.sum()
+        start += size
+    floored = trainer.feature_map.deviation <= trainer.config.features.deviation_floor * (1 + 1e-6)
+    row["floored_coordinates"] = floored.mean()
+    row["gradient_share_floored"] = (frame * floored).sum() / weight.sum()
+    limit = trainer.feature_map.clip * jnp.tile(trainer.feature_map.weight, trainer.env.horizon)
+    row["clipped_coordinates"] = (jnp.abs(query) >= limit * (1 - 1e-6)).mean()
+    return row
+
+
+def track(trainer: Trainer) -> dict[str, float]:
+    """Whether the servos can follow the demonstration at all: its joints as targets, the root carried along or free.
+
+    Returns:
+      Root-mean-square joint error (rad) with the root carried, the same for the worst joint, the share of actions
+      beyond one unit, and the steps until a fall with the root left free.
+    """
+    env, clip = trainer.env, trainer.clip
+    qpos, qvel = (jnp.asarray(x, jnp.float32) for x in (clip.qpos, clip.qvel))
+    lead = trainer.robot.damping / trainer.robot.stiffness  # s by which a damped servo trails its target
+    actions = (qpos[1:, 7:] + lead * qvel[1:, 6:] - env.actions.center) / env.actions.scale
+
+    def play(carried):
+        def step(sim, inputs):
+            action, q, v = inputs
+            sim, _, fell = env.advance(sim, action[None].astype(jnp.float32))
+            error = sim.qpos[0, 7:] - q[7:]
+            if carried:
+                sim = sim._replace(qpos=sim.qpos.at[0, :7].set(q[:7]), qvel=sim.qvel.at[0, :6].set(v[:6]))
+            return sim, (error, fell[0])
+
+        return jax.lax.scan(step, physics.reset(qpos[:1], qvel[:1]), (actions, qpos[1:], qvel[1:]))[1]
+
+    error, _ = jax.jit(lambda: play(True))()
+    _, fell = jax.jit(lambda: play(False))()
+    rms = np.sqrt(np.mean(np.asarray(error) ** 2, 0))
+    return {
+        "joint_error": float(np.sqrt(np.mean(rms**2))),
+        "worst_joint_error": float(rms.max()),
+        "worst_joint": trainer.robot.joint_names[int(rms.argmax())],
+        "actions_beyond_one": float(jnp.mean(jnp.abs(actions) > 1.0)),
+        "open_loop_steps": int(np.argmax(fell)) if np.asarray(fell).any() else len(fell),
+    }
+
+
+def measure(
+    out: Path,
+    preset_name: str = "laptop",
+    motion: str = "walk",
+    frames: str = "",
+    seed: int = 0,
+    transitions: int = 6_000_000,
+    every: int = 500_000,
+    set: tuple[str, ...] = (),  # noqa: A002 - the option's name
+) -> None:
+    """Train, and look at the run every so often.
+
+    Args:
+      out: folder for standing.csv, standing.json and standing.png.
+      preset_name: preset to start from.
+      motion: a bundled motion's name or a file.
+      frames: source rows "first:last" of the motion.
+      seed: of the run.
+      transitions: of the run.
+      every: transitions between two measurements.
+      set: any other setting as section.field=value.
+    """
+    changes = dict(item.partition("=")[::2] for item in set)
+    config: Config = preset(preset_name, motion=motion, frames=frames, seed=seed, transitions=transitions, **changes)
+    out.mkdir(parents=True, exist_ok=True)
+    trainer = Trainer(config, runs.load_motion(config))
+    tracking = track(trainer)
+    print("tracking: " + ", ".join(f"{k} {v if isinstance(v, str) else round(v, 4)}" for k, v in tracking.items()))
+    state = trainer.init()
+
+    @jax.jit
+    def look(state: TrainState, key):
+        gather_key, fit_key = jax.random.split(key)
+        moments = gather(trainer, state, gather_key)
+        rest = gradients(trainer, state, moments) | fits(trainer, state, moments, fit_key)
+        small = moments._replace(windows=jnp.zeros(0), pushed=jnp.zeros(0))
+        return small, rest
+
+    print("compiling ...", flush=True)
+    chunk = trainer.compile(state)
+    rows, due = [], every
+    while int(state.iteration) < config.iterations:
+        state, metrics = chunk(state)
+        done = int(state.iteration) * config.transitions_per_iteration
+        if done < due:
+            continue
+        due += every
+        began = time.monotonic()
+        moments, rest = look(state, jax.random.fold_in(jax.random.PRNGKey(seed), done))
+        row = {"transitions": done, "cap": float(state.env.cap), "speed": float(moments.speed.mean())}
+        row |= behaviours(moments) | {name: float(value) for name, value in rest.items()}
+        row |= {"deviation": float(metrics["ppo/deviation"]), "expert_margin": float(metrics["fit/expert_margin"])}
+        rows.append(row)
+        print(
+            f"{done / 1e6:5.2f} M | cap {row['cap']:3.0f} | speed {row['speed']:+.2f} m/s | standing "
+            f"{row['standing_share']:.2f}, reward {row['standing_reward']:.2f} | walking {row['walking_share']:.2f}, "
+            f"reward {row['walking_reward']:.2f} | survival {row['return_survival_share']:.2f} of the return | "
+            f"fit {row['online_correlation']:.2f}, longer {row['128_updates_correlation']:.2f} | "
+            f"{time.monotonic() - began:.0f} s",
+            flush=True,
+        )
+        with (out / "standing.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0])
+            writer.writeheader()
+            writer.writerows({k: f"{v:.6g}" for k, v in r.items()} for r in rows)
+    settings = {"preset": preset_name, "motion": Path(motion).name, "frames": frames, "seed": seed, "set": changes}
+    evaluation = json.loads(Evaluator(trainer)(state.ppo).to_json())
+    record = {"settings": settings, "tracking": tracking, "evaluation": evaluation, "provenance": runs.provenance()}
+    runs.write(out / "standing.json", json.dumps(record, indent=1).replace(motion, Path(motion).name))
+    print(f"wrote {out}/standing.csv and standing.json")
+    print(f"wrote {figure(out / 'standing.png', (out,))}")
+
+
+def figure(out: Path, runs: tuple[Path, ...]) -> Path:
+    """Draw the measurements of one or several folders.
+
+    Args:
+      out: PNG to write.
+      runs: folders that `measure` wrote.
+    """
+    return curves.comparison(out, {run.name: run / "standing.csv" for run in runs}, _PANELS)
+
+
+if __name__ == "__main__":
+    try:
+        tyro.extras.subcommand_cli_from_dict({"measure": measure, "figure": figure})
+    except UserError as error:
+        print(f"fmpjax: {error}", file=sys.stderr)
+        sys.exit(2)
