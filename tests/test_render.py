@@ -180,3 +180,17 @@ def test_curves_name_a_table_without_metrics(tmp_path):
     table.write_text("iteration,train/falls\n")
     with pytest.raises(UserError, match="no metrics"):
         curves.learning_curves(table, tmp_path / "curves.png")
+
+
+def test_grid_fills_its_panes_in_order(robot, walk):
+    """Five motions in three columns: the sixth pane stays white, panes of the same motion are the same picture."""
+    motions = [walk[:2], walk[1:3], walk[:1], walk[1:3], walk[:2]]
+    frames = render.grid(robot, motions, ["a"] * 5, columns=3, width=196, height=130, using="skeleton")
+    assert frames.shape == (2, 130, 196, 3)
+    assert (frames[:, 66:, 132:] == 255).all()
+    panes = [frames[0, y : y + 64, x : x + 64] for y in (0, 66) for x in (0, 66, 132)]
+    np.testing.assert_array_equal(panes[0], panes[4])
+    np.testing.assert_array_equal(panes[1], panes[3])
+    assert (panes[0] != panes[1]).any()
+    with pytest.raises(UserError, match="a motion to show has no frames"):
+        render.grid(robot, [walk[:0]], ["a"], using="skeleton")

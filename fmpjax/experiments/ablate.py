@@ -5,13 +5,14 @@
 
 import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import tyro
 
 from fmpjax.errors import UserError
 from fmpjax.experiments import cells, table
-from fmpjax.experiments.cells import Specification
+from fmpjax.experiments.cells import Cell, Specification
 
 
 def main(
@@ -25,6 +26,7 @@ def main(
     resets: tuple[str, ...] | None = None,
     seeds: tuple[int, ...] | None = None,
     workers: int = 1,
+    video: bool = False,
 ) -> None:
     """Run the matched comparison; started again, it goes on where it was.
 
@@ -39,6 +41,7 @@ def main(
       resets: `dataset` and `fixed` by default.
       seeds: 0 by default.
       workers: cells that run at once, each on its share of the cores.
+      video: film the final policies of each reset's first seed side by side.
     """
     from fmpjax import runs
 
@@ -52,8 +55,34 @@ def main(
     cells.run(planned, out, workers)
     paths = table.write(planned, out, runs.provenance())
     print((out / "table.md").read_text())
+    if video:
+        paths += films(planned, out)
     for path in paths:
         print(f"wrote {path}")
+
+
+def films(planned: Sequence[Cell], folder: Path, seconds: float = 10.0) -> list[Path]:
+    """A grid of the final policies for each reset, from the first seed; the paths written."""
+    from fmpjax import runs
+    from fmpjax.evaluate import Evaluator
+    from fmpjax.viz import render
+
+    paths, first = [], planned[0].config.seed
+    stride = 2  # 25 pictures a second
+    for reset in dict.fromkeys(cell.config.env.reset for cell in planned):
+        motions, labels = [], []
+        for cell in planned:
+            if cell.config.env.reset != reset or cell.config.seed != first:
+                continue
+            trainer, state = runs.Run.open(folder / cell.name).policy(best=False)
+            played = Evaluator(trainer, 8).play(state.ppo)
+            steps = slice(0, min(int(seconds * trainer.config.control_rate), int(played.length[0])), stride)
+            motions.append(played.qpos[steps, 0])
+            labels.append(table.title(cell.config.method, cell.variant))
+        frames = render.grid(trainer.robot, motions, labels, columns=min(3, len(motions)))
+        rate = trainer.config.control_rate / stride
+        paths.append(render.write_video(folder / f"policies-{reset}.mp4", frames, fps=rate))
+    return paths
 
 
 def cli(arguments: list[str] | None = None) -> None:

@@ -49,6 +49,11 @@ _PAPER = {
 }
 
 
+def title(method: str, variant: str = "") -> str:
+    """A method's name for people, with its variant's."""
+    return TITLES.get(method, method) + (f", {variant}" if variant else "")
+
+
 @dataclasses.dataclass(frozen=True)
 class Row:
     """One evaluation of one cell; figures that are not defined are NaN."""
@@ -116,7 +121,7 @@ def _lines(final: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     for (reset, method, variant), rows in _groups(final).items():
         ours = [_number(*_ordered(interval(r.figures[k] for r in rows), digits)) for k, _, digits in FIGURES]
         minutes = np.mean([r.seconds for r in rows]) / 60
-        name = TITLES.get(method, method) + (f", {variant}" if variant else "")
+        name = title(method, variant)
         lines.append([reset, name, str(len(rows)), *ours, f"{minutes:.0f}"])
         if not variant:
             theirs = [_number(v, d) for v, (_, _, d) in zip(_paper(reset, method), FIGURES, strict=True)]
@@ -166,7 +171,7 @@ def curves(rows: Sequence[Row], paths: Sequence[Path]) -> None:
         for panel, (key, title) in zip(line, panels, strict=True):
             for index, (method, variant) in enumerate(labels):
                 chosen = [r for r in rows if (r.reset, r.method, r.variant) == (reset, method, variant)]
-                name = TITLES.get(method, method) + (f", {variant}" if variant else "")
+                name = title(method, variant)
                 for seed in sorted({r.seed for r in chosen}):
                     mine = [r for r in chosen if r.seed == seed]
                     panel.plot(

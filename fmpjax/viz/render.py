@@ -148,18 +148,45 @@ def side_by_side(
     Returns:
       ``uint8 [max(T, U), height, width, 3]``.
     """
+    return grid(robot, (left_qpos, right_qpos), labels, columns=2, width=width, height=height, using=using)
+
+
+def grid(
+    robot: Robot,
+    motions: Sequence[np.ndarray],
+    labels: Sequence[str],
+    *,
+    columns: int = 3,
+    width: int = 960,
+    height: int = 640,
+    using: str | None = None,
+) -> np.ndarray:
+    """Draw several motions at once, each in a pane with its label; shorter ones hold their last frame.
+
+    Args:
+      robot: the robot.
+      motions: ``[T, 7 + J]`` each.
+      labels: one for each motion.
+      columns: panes in a row.
+      width: pixels, of all panes together.
+      height: pixels, of all panes together.
+      using: as in `render_frames`.
+
+    Returns:
+      ``uint8 [longest T, height, width, 3]``.
+    """
     gap = 2  # pixels between the panes
-    sizes = ((width - gap) // 2, width - gap - (width - gap) // 2)
-    panes = [
-        render_frames(robot, qpos, width=size, height=height, labels=label, using=using)
-        for qpos, size, label in zip((left_qpos, right_qpos), sizes, labels, strict=True)
-    ]
-    if min(map(len, panes)) == 0:
+    if not motions or min(map(len, motions)) == 0:
         raise UserError("a motion to show has no frames: expected at least one")
-    length = max(map(len, panes))
+    rows = -(-len(motions) // columns)
+    length = max(map(len, motions))
     frames = np.full((length, height, width, 3), 255, np.uint8)
-    frames[:, :, : sizes[0]] = panes[0][np.minimum(np.arange(length), len(panes[0]) - 1)]
-    frames[:, :, sizes[0] + gap :] = panes[1][np.minimum(np.arange(length), len(panes[1]) - 1)]
+    across, down = (np.linspace(0, size + gap, n + 1).astype(int) for size, n in ((width, columns), (height, rows)))
+    for index, (qpos, label) in enumerate(zip(motions, labels, strict=True)):
+        row, column = divmod(index, columns)
+        top, left, low, right = down[row], across[column], down[row + 1] - gap, across[column + 1] - gap
+        pane = render_frames(robot, qpos, width=right - left, height=low - top, labels=label, using=using)
+        frames[:, top:low, left:right] = pane[np.minimum(np.arange(length), len(pane) - 1)]
     return frames
 
 
