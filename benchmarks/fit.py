@@ -109,25 +109,25 @@ def main() -> None:
     settings = config.preset("paper")
     clip = motion.load(settings.motion, rate=settings.control_rate)
     trainer = Trainer(settings, clip)
-    windows, fitted = trainer.expert_features, settings.prior
+    windows, fitted = trainer.expert.windows, settings.prior
     dimension, size = trainer.feature_map.dimension, windows.shape[-1]
     pick_key, noise_key, prior_key, key = jax.random.split(jax.random.PRNGKey(0), 4)
     shape = (settings.ppo.rollout_steps, arguments.environments)
     picked = windows[jax.random.randint(pick_key, shape, 0, len(windows))]
     weight = jnp.tile(trainer.feature_map.weight, settings.features.history)
     features = picked + arguments.noise * weight * jax.random.normal(noise_key, picked.shape)
-    expert = windows[jnp.arange(fitted.bank) * len(windows) // fitted.bank]
     rollout = priors.Rollout(features, jnp.ones(shape, bool))
 
     def scan(updates: int):
         changed = dataclasses.replace(settings, prior=dataclasses.replace(fitted, updates=updates))
-        prior = priors.make("fmp", trainer.expert._replace(bank=expert), changed)
+        prior = priors.make("fmp", trainer.expert, changed)
         update, state = jax.jit(prior.update), prior.init(prior_key)
         return lambda: update(state, rollout, key)
 
     few, many = scan(FEW), scan(MANY)
     pool = features.reshape(-1, size)
     warm = many()
+    expert = windows[warm[0].bank]
     pieces = parts(fitted, dimension, pool[: fitted.bank], pool[-fitted.minibatch :], expert, warm[0].params)
     rate = matmul_rate(8, 2 * fitted.minibatch, size, fitted.hidden[0])
     for call in (few, many, *pieces.values()):

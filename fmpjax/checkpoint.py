@@ -40,19 +40,22 @@ class Checkpoints:
             if step not in manager.all_steps():
                 manager.save(step, args=ocp.args.StandardSave(_flatten(state)), force=True)
 
+    def iterations(self, *, best: bool = False) -> set[int]:
+        """Iterations of the checkpoints."""
+        kind = "best" if best else "checkpoints"
+        return {int(p.name) for p in (self.run / kind).glob("*") if p.name.isdigit()}
+
     def latest(self, *, best: bool = False) -> int | None:
         """Iteration of the newest checkpoint, or None."""
-        kind = "best" if best else "checkpoints"
-        steps = [int(p.name) for p in (self.run / kind).glob("*") if p.name.isdigit()]
-        return max(steps, default=None)
+        return max(self.iterations(best=best), default=None)
 
-    def restore(self, like: TrainState, *, best: bool = False) -> TrainState:
-        """The newest checkpoint, or the best one, in the structure of ``like``.
+    def restore(self, like: TrainState, iteration: int | None = None, *, best: bool = False) -> TrainState:
+        """A checkpoint, by default the newest, or the best one, in the structure of ``like``.
 
         Raises:
           UserError: there is none, it cannot be read, or it is of another configuration.
         """
-        step = self.latest(best=best)
+        step = self.latest(best=best) if iteration is None else iteration
         kind = "best" if best else "checkpoints"
         if step is None:
             raise UserError(f"run {self.run} has no checkpoint in {kind}/: expected one, train it first")

@@ -33,6 +33,8 @@ class Train:
     """Source rows first:last of the motion, 0-based, both included."""
     seed: int | None = None
     """Seed of everything that is random."""
+    seeds: int | None = None
+    """Train as many seeds at once, from --seed on, in one program: the runs RUN/seed0, RUN/seed1, and so on."""
     transitions: int | None = None
     """Budget of environment steps."""
     run: Path | None = None
@@ -47,38 +49,54 @@ class Train:
     def __call__(self) -> None:
         if self.minutes is not None and not self.minutes > 0:
             raise UserError(f"--minutes is {self.minutes:g}: expected more than 0")
-        run = self._open()
+        if self.seeds is not None and self.seeds < 1:
+            raise UserError(f"--seeds is {self.seeds}: expected at least 1")
         runs = _runs()
-        end = runs.train(run, resume=self.resume, minutes=self.minutes)
+        group = self._resumed() if self.resume else self._created()
+        end = runs.train(*group, resume=self.resume, minutes=self.minutes)
         # Who sends a signal wants the process to end, not to film.
         if end is not runs.End.SIGNAL:
-            for path in runs.finish(run):
-                print(f"wrote {path}")
+            for run in group:
+                for path in runs.finish(run):
+                    print(f"wrote {path}")
 
-    def _open(self):
+    def _resumed(self):
         runs = _runs()
-
+        if self.run is None:
+            raise UserError("--resume needs the run's folder: name it with --run")
         changes = self._changes()
-        if self.resume:
-            if self.run is None:
-                raise UserError("--resume needs the run's folder: name it with --run")
-            run = runs.Run.open(self.run)
-            saved = configuration.flatten(run.config)
-            if self.preset is not None and self.preset != saved["preset"]:
-                raise UserError(f"run {self.run} has preset {saved['preset']!r}: it cannot go on as {self.preset!r}")
-            asked = configuration.flatten(configuration.with_changes(run.config, changes))
-            for key in changes:
-                if asked[key] != saved[key]:
-                    raise UserError(f"run {self.run} has {key} {saved[key]!r}: it cannot go on with {asked[key]!r}")
-            return run
-        name = self.preset or _default_preset()
-        config = configuration.preset(name, **changes)
+        folders = sorted(self.run.glob("seed*"), key=lambda path: (len(path.name), path.name))
+        if (self.run / "config.json").exists() or not folders:
+            folders = [self.run]
+        elif "seed" in changes:
+            # Some of the seeds: as many as --seeds says, one by default, from --seed on.
+            first = int(changes["seed"])
+            folders = [self.run / f"seed{first + i}" for i in range(self.seeds or 1)]
+        if self.seeds is not None and self.seeds != len(folders):
+            raise UserError(f"run {self.run} has {len(folders)} seeds: it cannot go on with {self.seeds}")
+        group = [runs.Run.open(folder) for folder in folders]
+        saved = configuration.flatten(group[0].config)
+        if self.preset is not None and self.preset != saved["preset"]:
+            raise UserError(f"run {self.run} has preset {saved['preset']!r}: it cannot go on as {self.preset!r}")
+        asked = configuration.flatten(configuration.with_changes(group[0].config, changes))
+        for key in changes:
+            if asked[key] != saved[key]:
+                raise UserError(f"run {self.run} has {key} {saved[key]!r}: it cannot go on with {asked[key]!r}")
+        return group
+
+    def _created(self):
+        runs = _runs()
+        config = configuration.preset(self.preset or _default_preset(), **self._changes())
         from fmpjax import priors, robots
 
         priors.check(config.method)
         robots.load(config.robot)
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-        return runs.Run.create(self.run or Path("runs") / f"{config.method}-{stamp}", config)
+        folder = self.run or Path("runs") / f"{config.method}-{stamp}"
+        if self.seeds is None:
+            return [runs.Run.create(folder, config)]
+        seeds = range(config.seed, config.seed + self.seeds)
+        return [runs.Run.create(folder / f"seed{s}", dataclasses.replace(config, seed=s)) for s in seeds]
 
     def _changes(self) -> dict[str, object]:
         named = {

@@ -178,7 +178,7 @@ class Evaluator:
         pick = np.random.default_rng(0).permutation(len(steps))[:WINDOWS]
         rows = steps[pick, None] + 1 + np.arange(horizon)
         evaluated = trainer.feature_map(jnp.asarray(frames[rows, episodes[pick, None]]))
-        expert = trainer.expert_features[:: max(1, len(trainer.expert_features) // WINDOWS)]
+        expert = trainer.expert.windows[:: max(1, len(trainer.expert.windows) // WINDOWS)]
         return float(discrepancy(evaluated, expert, trainer.feature_map.dimension))
 
 

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from fmpjax.config import Config
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Evaluation, Evaluator, table
 from fmpjax.logs import MetricsLog, Progress, clock
-from fmpjax.train import Trainer, TrainState
+from fmpjax.train import Trainer, TrainState, stack, unstack
 from fmpjax.viz import curves, render
 
 _PACKAGES = "jax jaxlib mujoco mujoco-mjx brax flax optax ott-jax orbax-checkpoint numpy".split()
@@ -123,74 +124,117 @@ class End(enum.Enum):
     SIGNAL = "stopped"
 
 
-def train(run: Run, *, resume: bool = False, minutes: float | None = None) -> End:
-    """Train a run to the end of its budget, or of its time, or until it is told to stop; all three end cleanly."""
-    config, progress = run.config, Progress()
+def train(*group: Run, resume: bool = False, minutes: float | None = None) -> End:
+    """Train a run to the end of its budget, or of its time, or until it is told to stop; all three end cleanly.
+
+    Several runs that differ in nothing but their seeds are trained at once, as one program, each into its own folder.
+    """
+    config, progress = group[0].config, Progress()
     began = time.monotonic()
+    seeds = [run.config.seed for run in group]
     progress.note(
-        f"run {run.folder}: {config.method}, {config.preset}, {config.env.reset} reset, motion {config.motion}"
+        f"run {', '.join(str(run.folder) for run in group)}: {config.method}, {config.preset}, {config.env.reset} "
+        f"reset, motion {config.motion}"
     )
-    trainer = run.trainer()
-    state = trainer.init()
-    if resume and run.checkpoints.latest() is not None:
-        state = run.checkpoints.restore(state)
+    trainer = _shared_trainer(group)
+    states = _start(trainer, group, resume)
     evaluator = Evaluator(trainer)
-    done = int(state.iteration)
+    done = int(states[0].iteration)
     if done >= config.iterations:
         progress.note(f"the budget of {config.transitions:,} transitions is spent already")
         return End.BUDGET
     progress.note(f"{trainer.env.physics.name} physics on {_device_name()}; compiling, which takes a minute or so ...")
     compile_began = time.monotonic()
+    state = states[0] if len(group) == 1 else stack(states)
     chunk = trainer.compile(state)
     progress.note(f"compiled in {time.monotonic() - compile_began:.0f} s")
     names = [f"eval/{name}" for name in _evaluation_names()]
-    metric_names = sorted(jax.eval_shape(trainer.iteration, state)[1])
-    log = MetricsLog(run.folder, [*metric_names, *names], done)
+    metric_names = sorted(jax.eval_shape(trainer.iteration, states[0])[1])
+    logs = [MetricsLog(run.folder, [*metric_names, *names], done) for run in group]
     milestones = _milestones(config)
-    best, evaluated = _best(log)
-    training_seconds, saved = log.seconds, time.monotonic()
+    best, evaluated = [_best(log)[0] for log in logs], _best(logs[0])[1]
+    training_seconds, saved = logs[0].seconds, time.monotonic()
 
     with _StopSignals() as stop:
         while done < config.iterations:
             started = time.monotonic()
             state, metrics = chunk(state)
-            metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
+            metrics = jax.device_get(metrics)
             took = time.monotonic() - started
+            rows = [{name: float(np.ravel(value)[i]) for name, value in metrics.items()} for i in range(len(group))]
+            states = [state] if len(group) == 1 else unstack(state)
             training_seconds += took
-            done = int(state.iteration)
+            done = int(states[0].iteration)
             transitions = done * config.transitions_per_iteration
-            rate = config.chunk * config.transitions_per_iteration / took
-            left = (config.iterations - done) * config.transitions_per_iteration / rate
+            rate = len(group) * config.chunk * config.transitions_per_iteration / took
+            left = (config.iterations - done) * took / config.chunk
             if minutes is not None:
                 left = min(left, minutes * 60 - (time.monotonic() - began))
-            progress.show(_line(transitions, config, rate, left, metrics), final=done >= config.iterations)
-            _check_finite(run, state, config)
+            means = {name: float(np.nanmean([row[name] for row in rows])) for name in metrics}
+            progress.show(_line(transitions, config, rate, left, means), final=done >= config.iterations)
+            for run, each in zip(group, states, strict=True):
+                _check_finite(run, each, config)
             out_of_time = minutes is not None and time.monotonic() - began + 1.5 * took > minutes * 60
             stopping = out_of_time or stop.requested
             at_milestone = any(done >= m > evaluated for m in milestones)
             evaluating = (at_milestone or out_of_time) and not stop.requested
-            if evaluating:
-                evaluation, evaluated = evaluator(state.ppo), done
-                metrics |= {f"eval/{name}": float(value) for name, value in evaluation.as_dict().items()}
-                progress.note(f"evaluation at {transitions:,} transitions, {clock(training_seconds)} of training:")
-                progress.note(table(evaluation))
-            # Rows ahead of their checkpoint are computed again after a kill; rows behind it would be missing.
-            log.write(done, transitions, training_seconds, metrics)
-            if evaluating and evaluation.quality >= best:
-                best = evaluation.quality
-                run.checkpoints.save(state, best=True)
-            if evaluating or time.monotonic() - saved > _SAVE_INTERVAL:
-                run.checkpoints.save(state)
-                saved = time.monotonic()
+            saving = evaluating or time.monotonic() - saved > _SAVE_INTERVAL
+            for i, (run, log, each, row) in enumerate(zip(group, logs, states, rows, strict=True)):
+                better = False
+                if evaluating:
+                    evaluation, evaluated = evaluator(each.ppo), done
+                    row |= {f"eval/{name}": float(value) for name, value in evaluation.as_dict().items()}
+                    which = f"seed {seeds[i]}, " if len(group) > 1 else ""
+                    progress.note(f"evaluation at {transitions:,} transitions, {which}{clock(training_seconds)}:")
+                    progress.note(table(evaluation))
+                    better = evaluation.quality >= best[i]
+                # Rows ahead of their checkpoint are computed again after a kill; rows behind it would be missing.
+                log.write(done, transitions, training_seconds, row)
+                if better:
+                    best[i] = evaluation.quality
+                    run.checkpoints.save(each, best=True)
+                if saving:
+                    run.checkpoints.save(each)
+            saved = time.monotonic() if saving else saved
             if stopping:
                 break
-        run.checkpoints.save(state)
-    log.close()
+        for run, each in zip(group, states, strict=True):
+            run.checkpoints.save(each)
+    for log in logs:
+        log.close()
     if done >= config.iterations:
         return End.BUDGET
     end = End.SIGNAL if stop.requested else End.TIME
     progress.note(f"{end.value} at {transitions:,} transitions; saved. Go on with --resume.")
     return end
+
+
+def _shared_trainer(group: Sequence[Run]) -> Trainer:
+    """The trainer of runs that differ in nothing but their seeds.
+
+    Raises:
+      UserError: they differ in more.
+    """
+    trainer = group[0].trainer()
+    first = configuration.flatten(group[0].config)
+    for run in group[1:]:
+        for key, value in configuration.flatten(run.config).items():
+            if key != "seed" and value != first[key]:
+                raise UserError(
+                    f"run {run.folder} has {key} {value!r} and run {group[0].folder} {first[key]!r}: "
+                    "runs that train at once differ in their seeds alone"
+                )
+        run._trainer = trainer
+    return trainer
+
+
+def _start(trainer: Trainer, group: Sequence[Run], resume: bool) -> list[TrainState]:
+    """States to begin with: those of the newest checkpoint that all runs have, or those of their seeds."""
+    states = [trainer.init(run.config.seed) for run in group]
+    common = set.intersection(*(run.checkpoints.iterations() for run in group)) if resume else set()
+    if not common:
+        return states
+    return [run.checkpoints.restore(like, max(common)) for run, like in zip(group, states, strict=True)]
 
 
 def finish(run: Run) -> list[Path]:

@@ -3,8 +3,8 @@
 Here all parts meet: rollout, windows, prior, rewards, policy. Nothing in this file knows a method by name.
 """
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Sequence
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import jax
@@ -55,20 +55,18 @@ class Trainer:
         self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo)
         windows = self.env.clip_windows()
         self.feature_map = features.fit_feature_map(self.robot, windows, config.features)
-        self.expert_features = self.feature_map(windows)  # [W, D], every window of the demonstration
-        bank = expert_bank_rows(jax.random.PRNGKey(config.seed), len(windows), config.prior.bank)
         self.expert = priors.Expert(
-            bank=self.expert_features[bank],  # [m, D], E of the paper
-            windows=self.expert_features,
+            windows=self.feature_map(windows),
             dimension=float(self.feature_map.dimension),
             weight=jnp.tile(self.feature_map.weight, self.env.horizon),
             horizon=self.env.horizon,
         )
         self.prior = priors.make(config.method, self.expert, config)
 
-    def init(self) -> TrainState:
-        """The state at iteration zero, a function of the configuration's seed."""
-        key, ppo_key, prior_key, env_key = jax.random.split(jax.random.PRNGKey(self.config.seed), 4)
+    def init(self, seed: int | None = None) -> TrainState:
+        """The state at iteration zero, a function of the seed, by default the configuration's."""
+        seed = self.config.seed if seed is None else seed
+        key, ppo_key, prior_key, env_key = jax.random.split(jax.random.PRNGKey(seed), 4)
         state = TrainState(
             ppo=self.ppo.init(ppo_key, self.env.clip_observations),
             prior=self.prior.init(prior_key),
@@ -102,23 +100,29 @@ class Trainer:
         return TrainState(ppo, prior, env, key, state.iteration + 1, nonfinite), metrics
 
     def compile(self, state: TrainState) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
-        """The compiled program of a run: ``config.chunk`` iterations, metrics averaged over them."""
+        """The compiled program of a run: ``config.chunk`` iterations, metrics averaged over them.
 
-        @partial(jax.jit, donate_argnums=0)
+        A state whose leaves have a leading axis of seeds, as `stack` makes it, gives metrics with that axis.
+        """
+
         def chunk(state: TrainState) -> tuple[TrainState, Metrics]:
             state, metrics = jax.lax.scan(self.iteration, state, None, length=self.config.chunk)
             return state, jax.tree.map(jnp.nanmean, metrics)
 
+        chunk = jax.vmap(chunk) if state.iteration.ndim else chunk
+        chunk = jax.jit(chunk, donate_argnums=0)
+
         return chunk.lower(state).compile()
 
 
-def expert_bank_rows(key: jax.Array, windows: int, size: int) -> jax.Array:
-    """Windows ``[size]`` of the expert bank: spread evenly over the demonstration, repeated where it is shorter.
+def stack(states: Sequence[TrainState]) -> TrainState:
+    """States of several seeds as one, each leaf with a leading axis of seeds."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
 
-    An even spread is a stratified draw: it has the uniform draw's mean and less variance.
-    """
-    offset = jax.random.uniform(key)
-    return jnp.floor((jnp.arange(size) + offset) * windows / size).astype(jnp.int32)
+
+def unstack(state: TrainState) -> list[TrainState]:
+    """The states of the seeds in a stacked state."""
+    return [jax.tree.map(itemgetter(i), state) for i in range(len(state.iteration))]
 
 
 def _batch(steps: Steps, reward: jax.Array) -> Batch:

@@ -45,7 +45,7 @@ def test_plan_from_a_file(tmp_path):
     )
     planned = cells.plan(spec)
     assert [c.name for c in planned] == [
-        "fmp-dataset-short-0", "fmp-dataset-short-1", "fmp-dataset-long-0", "fmp-dataset-long-1",
+        "fmp-dataset-short/seed0", "fmp-dataset-short/seed1", "fmp-dataset-long/seed0", "fmp-dataset-long/seed1",
     ]  # fmt: skip
     assert [c.config.env.first_cap for c in planned] == [32, 32, 64, 64]
     assert {c.config.ppo.discount for c in planned} == {0.9}
@@ -112,11 +112,12 @@ def test_ablate_writes_tables_and_curves(ablated):
     assert all(cells.finished(cell, folder / "out") for cell in planned)
     results = json.loads((folder / "out" / "results.json").read_text())
     assert [(e["cell"], e["transitions"]) for e in results["evaluations"]] == [
-        ("fmp-fixed-0", 128), ("fmp-fixed-0", 256), ("barycentric-fixed-0", 128), ("barycentric-fixed-0", 256),
+        ("fmp-fixed/seed0", 128), ("fmp-fixed/seed0", 256),
+        ("barycentric-fixed/seed0", 128), ("barycentric-fixed/seed0", 256),
     ]  # fmt: skip
     assert results["provenance"]["python"]
     rows = table.evaluations(planned[0], folder / "out")
-    saved = json.loads((folder / "out" / "fmp-fixed-0" / "config.json").read_text())
+    saved = json.loads((folder / "out" / "fmp-fixed/seed0" / "config.json").read_text())
     assert (rows[-1].method, rows[-1].reset, rows[-1].seed) == ("fmp", "fixed", saved["seed"])
 
 
@@ -125,12 +126,12 @@ def test_finished_cells_are_left_alone_and_unfinished_ones_go_on(ablated, capsys
     """A cell cut back to half its course, as a kill would leave it, is finished; the other is not touched."""
     folder, planned = ablated
     out = folder / "out"
-    stamp = (out / "barycentric-fixed-0" / "metrics.csv").stat().st_mtime_ns
-    (out / "fmp-fixed-0" / "evaluation.json").unlink()
+    stamp = (out / "barycentric-fixed/seed0" / "metrics.csv").stat().st_mtime_ns
+    (out / "fmp-fixed/seed0" / "evaluation.json").unlink()
     assert not cells.finished(planned[0], out)
     cells.run(planned, out)
     assert cells.finished(planned[0], out)
-    assert (out / "barycentric-fixed-0" / "metrics.csv").stat().st_mtime_ns == stamp
+    assert (out / "barycentric-fixed/seed0" / "metrics.csv").stat().st_mtime_ns == stamp
     assert "2 cells, 1 of them finished before" in capsys.readouterr().out
 
 
@@ -140,7 +141,9 @@ def test_results_of_another_configuration_are_refused(ablated):
     other = cells.plan(
         cells.Specification(preset="smoke", methods=("fmp",), resets=("fixed",), settings=TINY | {"ppo.discount": 0.5})
     )
-    with pytest.raises(UserError, match=r"fmp-fixed-0 holds a run with ppo.discount 0.97, not 0.5: name another --out"):
+    with pytest.raises(
+        UserError, match=r"fmp-fixed/seed0 holds a run with ppo.discount 0.97, not 0.5: name another --out"
+    ):
         cells.run(other, folder / "out")
 
 
@@ -148,9 +151,9 @@ def test_results_of_another_configuration_are_refused(ablated):
 def test_a_cell_that_fails_is_named_after_the_others_ran(tmp_path):
     changes = TINY | {"motion": str(tmp_path / "none.npz")}
     bad = cells.plan(cells.Specification(preset="smoke", methods=("fmp",), resets=("fixed",), settings=changes))
-    with pytest.raises(UserError, match=r"1 of 1 cells failed: see .*fmp-fixed-0.log \(fmp-fixed-0\)"):
+    with pytest.raises(UserError, match=r"1 of the cells failed: see .*fmp-fixed/seed0.log \(fmp-fixed/seed0\)"):
         cells.run(bad, tmp_path / "out")
-    assert "none.npz" in (tmp_path / "out" / "fmp-fixed-0.log").read_text()
+    assert "none.npz" in (tmp_path / "out" / "fmp-fixed/seed0.log").read_text()
 
 
 # --- tables ----------------------------------------------------------------------------------------------------------

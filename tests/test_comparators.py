@@ -20,10 +20,10 @@ SMALL = Config(
 
 
 def expert_of(windows, horizon=1):
-    """Windows ``[W, D]`` as the demonstration, all of them the bank; every coordinate counts once."""
+    """Windows ``[W, D]`` as the demonstration; every coordinate counts once."""
     windows = jnp.asarray(windows, jnp.float32)
     size = windows.shape[-1]
-    return Expert(windows, windows, float(size), jnp.full(size, size**-0.5), horizon)
+    return Expert(windows, float(size), jnp.full(size, size**-0.5), horizon)
 
 
 def rollout_of(points, valid=None):
@@ -110,7 +110,7 @@ def test_averaged_score_is_the_mean_of_its_banks(cloud):
     query = jnp.asarray(points, jnp.float32)
     expected = np.mean(
         [
-            transport.fit_score(source, expert.bank, epsilon=epsilon).score(query)
+            transport.fit_score(source, expert.windows[state.bank], epsilon=epsilon).score(query)
             for source, epsilon in zip(state.source, state.epsilon, strict=True)
         ],
         axis=0,
@@ -290,7 +290,7 @@ def test_amp_slopes_are_those_of_the_full_window():
     """
     windows = jnp.asarray(np.random.default_rng(2).normal(size=(64, 2)), jnp.float32)
     weight = jnp.array([2.0**0.5, 1.0]) / 3.0**0.5  # one coordinate of three stands twice
-    expert = Expert(windows * weight, windows * weight, 3.0, weight, 1)
+    expert = Expert(windows * weight, 3.0, weight, 1)
     prior = amp.make(expert, dataclasses.replace(SMALL, amp=dataclasses.replace(SMALL.amp, hidden=())))
     state = prior.init(jax.random.PRNGKey(0))
     kernel = np.asarray(state.params["params"]["logit"]["kernel"])[:, 0]

@@ -29,7 +29,7 @@ def make(method, expert, config):
     bank = jnp.asarray(expert, jnp.float32)
     size = bank.shape[-1]
     weight = jnp.full(size, size**-0.5)
-    return priors.make(method, priors.Expert(bank, bank, float(size), weight, 1), Config(prior=config))
+    return priors.make(method, priors.Expert(bank, float(size), weight, 1), Config(prior=config))
 
 
 @jax.jit

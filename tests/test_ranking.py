@@ -32,7 +32,7 @@ def standing_pool(trainer, count=1024, seed=0):
 def test_copies_are_what_they_say(trainer):
     copies = ranking.copies(trainer)
     demonstration = copies["demonstration"]
-    assert np.allclose(demonstration, trainer.expert_features, atol=1e-5)
+    assert np.allclose(demonstration, trainer.expert.windows, atol=1e-5)
     # Halving the speed doubles the samples; a shuffle keeps every window's coordinates but for x and y.
     assert len(copies["slowed to half"]) == 2 * len(trainer.clip) - 1 - trainer.env.horizon + 1
     frames = copies["frozen"].reshape(len(copies["frozen"]), trainer.env.horizon, -1)

@@ -23,7 +23,8 @@ from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import preset
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Episodes, Evaluator
-from fmpjax.train import Trainer, expert_bank_rows
+from fmpjax.priors import bank_rows
+from fmpjax.train import Trainer
 
 # Eight environments, eight steps, five chunks of two iterations: a second of training after the compilation.
 TINY = {
@@ -302,7 +303,7 @@ def test_no_checkpoint_is_said(tmp_path):
 @pytest.mark.parametrize(("windows", "size"), [(370, 256), (342, 256), (256, 256), (40, 256), (1000, 7), (1, 5)])
 def test_expert_bank_is_even_and_in_range(windows, size):
     for seed in range(20):
-        picked = np.asarray(expert_bank_rows(jax.random.PRNGKey(seed), windows, size))
+        picked = np.asarray(bank_rows(jax.random.PRNGKey(seed), windows, size))
         assert picked.shape == (size,) and picked.min() >= 0 and picked.max() < windows
         # Every gap, that around the end included, is the mean one rounded down or up; so are the repetitions.
         gaps = np.diff(np.append(picked, picked[0] + windows))
@@ -337,7 +338,7 @@ def test_seeds_decide_the_start(trainer):
     again, other = Trainer(tiny(), trainer.clip), Trainer(tiny(seed=1), trainer.clip)
     np.testing.assert_array_equal(flat(trainer.init()), flat(again.init()))
     assert np.any(flat(trainer.init()) != flat(other.init()))
-    assert np.any(np.asarray(trainer.expert.bank) != np.asarray(other.expert.bank))
+    assert np.any(np.asarray(trainer.init().prior.bank) != np.asarray(other.init().prior.bank))
 
 
 # --- evaluation ------------------------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ def main(
     resets: tuple[str, ...] | None = None,
     seeds: tuple[int, ...] | None = None,
     workers: int = 1,
+    together: bool = False,
     video: bool = False,
 ) -> None:
     """Run the matched comparison; started again, it goes on where it was.
@@ -41,6 +42,7 @@ def main(
       resets: `dataset` and `fixed` by default.
       seeds: 0 by default.
       workers: cells that run at once, each on its share of the cores.
+      together: train all seeds of a method and reset as one program, which pays on an accelerator.
       video: film the final policies of each reset's first seed side by side.
     """
     from fmpjax import runs
@@ -52,7 +54,7 @@ def main(
     }  # fmt: skip
     specification = dataclasses.replace(specification, **{k: v for k, v in named.items() if v is not None})
     planned = cells.plan(specification)
-    cells.run(planned, out, workers)
+    cells.run(planned, out, workers, together=together)
     paths = table.write(planned, out, runs.provenance())
     print((out / "table.md").read_text())
     if video:

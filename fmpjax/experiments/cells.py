@@ -8,6 +8,7 @@ alone, and one of another configuration is refused.
 import dataclasses
 import itertools
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -45,10 +46,15 @@ class Specification:
 class Cell:
     """One run of an experiment."""
 
-    name: str  # also its folder's
+    name: str  # METHOD-RESET[-VARIANT]/seedSEED, also its folder
     variant: str  # "" where the specification has none
     config: Config
     changes: Mapping[str, Any]  # by which the configuration departs from its preset
+
+    @property
+    def group(self) -> str:
+        """What the cell shares with those that differ in nothing but the seed."""
+        return self.name.partition("/")[0]
 
     @property
     def command(self) -> list[str]:
@@ -116,8 +122,8 @@ def plan(specification: Specification) -> list[Cell]:
         changes |= {"frames": s.frames} if s.frames else {}
         changes |= {"transitions": s.transitions} if s.transitions else {}
         changes |= {**s.settings, **variants[variant]}
-        name = "-".join(part for part in (method, reset, variant, str(seed)) if part)
-        cells.append(Cell(name, variant, configuration.preset(s.preset, **changes), changes))
+        group = "-".join(part for part in (method, reset, variant) if part)
+        cells.append(Cell(f"{group}/seed{seed}", variant, configuration.preset(s.preset, **changes), changes))
     return cells
 
 
@@ -142,8 +148,14 @@ def _done(cell: Cell, folder: Path) -> int:
     return int(rows[-1]["iteration"]) if rows else 0
 
 
-def run(cells: Sequence[Cell], folder: Path, workers: int = 1) -> None:
+def run(cells: Sequence[Cell], folder: Path, workers: int = 1, *, together: bool = False) -> None:
     """Run what is not finished yet, ``workers`` at once.
+
+    Args:
+      cells: of one plan.
+      folder: where their run folders are.
+      workers: processes at once, each on its share of the cores.
+      together: train all seeds of a group in one process as one program, which pays on an accelerator.
 
     Raises:
       UserError: a folder holds another configuration (before anything runs), or cells failed (after all others ran).
@@ -151,51 +163,105 @@ def run(cells: Sequence[Cell], folder: Path, workers: int = 1) -> None:
     todo = [cell for cell in cells if not finished(cell, folder)]
     progress = Progress(30.0)
     progress.note(f"{len(cells)} cells, {len(cells) - len(todo)} of them finished before")
-    if not todo:
-        return
-    folder.mkdir(parents=True, exist_ok=True)
     shares = _shares(workers)
-    waiting, running, failed = list(todo), {}, []
-    began, spent = time.monotonic(), []
-    # Work is counted in iterations of every cell's own; the rate so far gives the time left.
-    total = sum(cell.config.iterations - _done(cell, folder) for cell in todo)
-    before = {cell.name: _done(cell, folder) for cell in todo}
+    waiting = _jobs(todo, folder, together)
+    running: dict[int, _Job] = {}
+    failed: list[_Job] = []
+    began, before = time.monotonic(), {cell.name: _done(cell, folder) for cell in todo}
+    total = sum(cell.config.iterations - before[cell.name] for cell in todo)
     try:
         while waiting or running:
-            for index in range(len(shares)):
-                if index not in running and waiting:
-                    cell = waiting.pop(0)
-                    running[index] = (cell, _start(cell, folder, shares[index]), time.monotonic())
-                    progress.note(f"{cell.name} begins, log in {folder / cell.name}.log")
+            for index in set(range(len(shares))) - set(running):
+                if waiting:
+                    running[index] = waiting.pop(0)
+                    running[index].start(folder, shares[index])
+                    progress.note(f"{running[index].name} begins, log in {running[index].log(folder)}")
             time.sleep(_POLL)
-            for index, (cell, process, started) in list(running.items()):
-                if process.poll() is None:
+            for index, job in list(running.items()):
+                if job.process.poll() is None:
                     continue
                 del running[index]
-                took = time.monotonic() - started
-                if process.returncode or not finished(cell, folder):
-                    failed.append(cell.name)
-                    progress.note(f"{cell.name} FAILED after {clock(took)}")
-                else:
-                    spent.append(took)
-                    progress.note(f"{cell.name} is done after {clock(took)}")
-            done = sum(_done(cell, folder) - before[cell.name] for cell in todo if cell not in waiting)
-            elapsed = time.monotonic() - began
-            left = clock(elapsed * (total - done) / done) if done else "unknown time"
-            now = ", ".join(
-                f"{cell.name} {100 * _done(cell, folder) / cell.config.iterations:.0f} %"
-                for cell, _, _ in running.values()
-            )
-            progress.show(f"{len(todo) - len(waiting) - len(running)} of {len(todo)} done | {now} | {left} left")
+                good = job.process.returncode == 0 and all(finished(cell, folder) for cell in job.cells)
+                failed += [] if good else [job]
+                progress.note(f"{job.name} {'is done' if good else 'FAILED'} after {clock(job.seconds)}")
+            # Work is counted in iterations; the rate so far gives the time left.
+            done = sum(_done(cell, folder) - before[cell.name] for cell in todo)
+            left = clock((time.monotonic() - began) * (total - done) / done) if done > 0 else "unknown time"
+            now = ", ".join(f"{job.name} {100 * job.share(folder):.0f} %" for job in running.values())
+            progress.show(f"{sum(finished(c, folder) for c in todo)} of {len(todo)} done | {now} | {left} left")
     finally:
-        for _, process, _ in running.values():
-            process.send_signal(signal.SIGTERM)
-        for _, process, _ in running.values():
-            process.wait()
+        for job in running.values():
+            job.process.send_signal(signal.SIGTERM)
+        for job in running.values():
+            job.process.wait()
     if failed:
-        raise UserError(
-            f"{len(failed)} of {len(todo)} cells failed: see {folder / failed[0]}.log ({', '.join(failed)})"
-        )
+        names = ", ".join(job.name for job in failed)
+        raise UserError(f"{len(failed)} of the cells failed: see {failed[0].log(folder)} ({names})")
+
+
+@dataclasses.dataclass
+class _Job:
+    """Cells of one process."""
+
+    cells: list[Cell]
+    process: subprocess.Popen | None = None
+    began: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return self.cells[0].name if len(self.cells) == 1 else f"{self.cells[0].group} ({len(self.cells)} seeds)"
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self.began
+
+    def share(self, folder: Path) -> float:
+        """Share of the budget that is spent."""
+        return sum(_done(cell, folder) for cell in self.cells) / sum(cell.config.iterations for cell in self.cells)
+
+    def log(self, folder: Path) -> Path:
+        return folder / f"{self.cells[0].name}.log"
+
+    def start(self, folder: Path, cores: set[int]) -> None:
+        """Begin, or go on where an earlier process was killed."""
+        first = self.cells[0]
+        begun = all((folder / cell.name / "config.json").exists() for cell in self.cells)
+        if not begun:
+            # A process that was killed while it made the folders left them behind: `_jobs` has seen that nothing more
+            # than a beginning is in them.
+            for cell in self.cells:
+                shutil.rmtree(folder / cell.name, ignore_errors=True)
+        if len(self.cells) == 1:
+            where = ["--run", str(folder / first.name)]
+        else:
+            where = ["--run", str(folder / first.group), "--seeds", str(len(self.cells))]
+        arguments = [*first.command, *where, *(["--resume"] if begun else [])]
+        self.log(folder).parent.mkdir(parents=True, exist_ok=True)
+        self.began = time.monotonic()
+        with self.log(folder).open("a") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", _LAUNCH, ",".join(map(str, sorted(cores))), *arguments],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # a Ctrl-C reaches the cells through us, once
+            )
+
+
+def _jobs(todo: Sequence[Cell], folder: Path, together: bool) -> list[_Job]:
+    """Processes for the cells to do; together, consecutive seeds of a group that have got as far are one."""
+    if not together:
+        return [_Job([cell]) for cell in todo]
+    jobs: list[_Job] = []
+    for cell in sorted(todo, key=lambda cell: cell.config.seed):
+        for job in jobs:
+            last = job.cells[-1]
+            follows = last.group == cell.group and cell.config.seed == last.config.seed + 1
+            if follows and (_done(last, folder) > 0) == (_done(cell, folder) > 0):
+                job.cells.append(cell)
+                break
+        else:
+            jobs.append(_Job([cell]))
+    return jobs
 
 
 def _shares(workers: int) -> list[set[int]]:
@@ -217,16 +283,3 @@ if cores:
 from fmpjax.cli import main
 main(sys.argv[2:])
 """
-
-
-def _start(cell: Cell, folder: Path, cores: set[int]) -> subprocess.Popen:
-    where = folder / cell.name
-    begun = (where / "config.json").exists()
-    arguments = [*cell.command, "--run", str(where), *(["--resume"] if begun else [])]
-    with (folder / f"{cell.name}.log").open("a") as log:
-        return subprocess.Popen(
-            [sys.executable, "-c", _LAUNCH, ",".join(map(str, sorted(cores))), *arguments],
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,  # a Ctrl-C reaches the cells through us, once
-        )

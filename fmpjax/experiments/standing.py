@@ -42,7 +42,7 @@ _PANELS = {
     "return explained by survival": ("return_survival_share",),
     "agreement of two gradients": ("gradient_agreement", "gradient_survival_cosine"),
     "correlation: 3 updates, 128": ("online_correlation", "128_updates_correlation"),
-    "gain of a 0.1 m/s push, spreads": ("standing_push_gain",),
+    "gain of a 0.1 m/s push, spreads: all, standing": ("push_gain", "standing_push_gain"),
 }
 
 
@@ -204,7 +204,7 @@ def fits(trainer: Trainer, state: TrainState, moments: Moments, key: jax.Array) 
     pool = moments.windows.reshape(-1, moments.windows.shape[-1])
     pick_key, bank_key, fit_key = jax.random.split(key, 3)
     query = pool[jax.random.randint(pick_key, (QUERIES,), 0, len(pool))]
-    truth = reference(pool, trainer.expert.bank, query, trainer, bank_key)
+    truth = reference(pool, trainer.expert.windows[state.prior.bank], query, trainer, bank_key)
     low, high = jnp.quantile(truth.score, jnp.array([0.25, 0.75]))
     spread = jnp.maximum(high - low, config.spread_floor)
     longer = dataclasses.replace(trainer.config, prior=dataclasses.replace(config, updates=128))
@@ -225,7 +225,8 @@ def fits(trainer: Trainer, state: TrainState, moments: Moments, key: jax.Array) 
     spread = jnp.subtract(*jnp.quantile(score, jnp.array([0.75, 0.25])))
     gain = trainer.prior.score(state.prior, moments.pushed.reshape(pool.shape)) - score
     standing = jnp.abs(moments.speed.ravel()) < STANDING
-    # What the reward's argument gains, in its own units, if a standing window were PUSH faster.
+    # What the reward's argument gains, in its own units, if a window, or a standing one, were PUSH faster.
+    row["push_gain"] = gain.mean() / spread
     row["standing_push_gain"] = jnp.where(standing, gain, 0.0).sum() / jnp.maximum(standing.sum(), 1) / spread
     weight = truth.gradient**2
     frame = weight.reshape(len(query), trainer.env.horizon, -1)

@@ -34,12 +34,17 @@ class NativePhysics:
         packed = jnp.concatenate([*state, targets.astype(state.qpos.dtype)], axis=-1)
         nq, nv = self.model.nq, self.model.nv
         shape = jax.ShapeDtypeStruct((*packed.shape[:-1], nq + 2 * nv), packed.dtype)
-        reached = jax.pure_callback(self._advance, shape, packed, vmap_method="sequential")
+        reached = jax.pure_callback(self._advance, shape, packed, vmap_method="broadcast_all")
         return PhysicsState(*jnp.split(reached, (nq, nq + nv), axis=-1))
 
     def _advance(self, packed) -> np.ndarray:
-        """Rows ``qpos, qvel, warmstart`` after a control step from rows ``qpos, qvel, warmstart, targets``."""
+        """Rows ``qpos, qvel, warmstart`` after a control step from rows ``qpos, qvel, warmstart, targets``.
+
+        Batches of batches, as `jax.vmap` makes them, are advanced at once.
+        """
         packed = np.asarray(packed)
+        batch = packed.shape[:-1]
+        packed = packed.reshape(-1, packed.shape[-1])
         count, nq, nv = len(packed), self.model.nq, self.model.nv
         shape = (count, self.substeps, 1 + nq + nv)
         # MuJoCo's full physics state begins with the time, which nothing here depends on.
@@ -62,7 +67,7 @@ class NativePhysics:
         reached[:, : nq + nv] = states[:, -1, 1:]
         # The rollout does not return its solver's last acceleration; the last velocity step stands in.
         reached[:, nq + nv :] = (states[:, -1, 1 + nq :] - before[:, 1 + nq :]) / self.model.opt.timestep
-        return reached
+        return reached.reshape(*batch, -1)
 
 
 def model(robot: Robot, config: PhysicsConfig) -> mujoco.MjModel:

@@ -154,7 +154,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
 
     def update(state: AMPState, rollout: Rollout, key):
         steps, count, _ = rollout.features.shape
-        pool = jnp.where(rollout.valid[..., None], rollout.features, expert.bank[0]).reshape(-1, size)
+        pool = jnp.where(rollout.valid[..., None], rollout.features, expert.windows[0]).reshape(-1, size)
         order_key, expert_key, replay_key, store_key = jax.random.split(key, 4)
         logits = score(state, pool)
         reward = reward_of(logits, settings).reshape(steps, count)
@@ -198,7 +198,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
             "skipped": stats["skipped"].sum(),
             "score_median": middle,
             "score_spread": high - low,
-            "expert_margin": (score(state, expert.bank).mean() - middle) / jnp.maximum(high - low, 1e-6),
+            "expert_margin": (score(state, expert.windows).mean() - middle) / jnp.maximum(high - low, 1e-6),
             "replayed": replay.count.astype(jnp.float32),
         }
         return AMPState(params, optimizer_state, normalizer, replay), reward, summary

@@ -12,7 +12,7 @@ import numpy as np
 
 from fmpjax import transport
 from fmpjax.config import Config, PriorConfig
-from fmpjax.priors.base import Expert, MotionPrior, Rollout
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, bank_rows
 
 
 class BarycentricState(NamedTuple):
@@ -64,7 +64,8 @@ def make(expert: Expert, config: Config) -> MotionPrior:
     scale = expert.dimension / (per_frame * settings.temperature)
 
     def init(key):
-        condition, successor = split(expert.bank, expert.horizon)
+        rows = bank_rows(key, len(expert.windows), settings.bank)
+        condition, successor = split(expert.windows[rows], expert.horizon)
         return BarycentricState(condition, successor, jnp.zeros(len(condition)), jnp.float32(1.0))
 
     def score(state: BarycentricState, x):
@@ -75,7 +76,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
 
     def update(state: BarycentricState, rollout: Rollout, key):
         steps, count, size = rollout.features.shape
-        pool = jnp.where(rollout.valid[..., None], rollout.features, expert.bank[0]).reshape(-1, size)
+        pool = jnp.where(rollout.valid[..., None], rollout.features, expert.windows[0]).reshape(-1, size)
         source_key, expert_key = jax.random.split(key)
         source = pool[jax.random.randint(source_key, (settings.bank,), 0, len(pool))]
         rows = jax.random.randint(expert_key, (settings.bank,), 0, len(expert.windows))

@@ -20,7 +20,6 @@ class Rollout(NamedTuple):
 class Expert(NamedTuple):
     """The demonstration as a prior sees it, in the fixed features."""
 
-    bank: jax.Array  # [m, D] fixed expert bank E
     windows: jax.Array  # [W, D] every window
     dimension: float  # d, coordinates of the full features that the D stand for
     weight: jax.Array  # [D] feature of a standardised coordinate: root of its multiplicity over sqrt(d)
@@ -37,6 +36,15 @@ class MotionPrior(NamedTuple):
     init: Callable[[jax.Array], PriorState]
     update: Callable[[PriorState, Rollout, jax.Array], tuple[PriorState, jax.Array, Metrics]]
     score: Callable[[PriorState, jax.Array], jax.Array]  # of features [n, D], higher is better, before normalisation
+
+
+def bank_rows(key: jax.Array, windows: int, size: int) -> jax.Array:
+    """Windows ``[size]`` of an expert bank: spread evenly over the demonstration, repeated where it is shorter.
+
+    An even spread is a stratified draw: it has the uniform draw's mean and less variance.
+    """
+    offset = jax.random.uniform(key)
+    return jnp.floor((jnp.arange(size) + offset) * windows / size).astype(jnp.int32)
 
 
 class Reward(NamedTuple):

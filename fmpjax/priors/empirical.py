@@ -10,12 +10,13 @@ import jax.numpy as jnp
 
 from fmpjax import transport
 from fmpjax.config import Config
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, median_reward
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, bank_rows, median_reward
 
 
 class EmpiricalState(NamedTuple):
     """The source banks of the last rollout, solved."""
 
+    bank: jax.Array  # [m] int32, rows of the demonstration's windows, drawn once
     source: jax.Array  # [k, n, D]
     self_dual: jax.Array  # [k, n]
     expert_dual: jax.Array  # [k, m]
@@ -24,9 +25,9 @@ class EmpiricalState(NamedTuple):
 
 def make(expert: Expert, config: Config) -> MotionPrior:
     """The mean of ``config.prior.score_banks`` transport scores; nothing is learned."""
-    settings, bank = config.prior, expert.bank
+    settings, windows = config.prior, expert.windows
 
-    def solve(source):
+    def solve(source, bank):
         cross = transport.squared_cost(source, bank)
         return transport.solve(
             cross,
@@ -37,13 +38,14 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         )
 
     def init(key):
-        # Banks of nothing but the demonstration: every score is the same.
-        source = jnp.broadcast_to(bank[:1], (settings.score_banks, settings.bank, bank.shape[-1]))
-        zeros = jnp.zeros((settings.score_banks, settings.bank))
-        return EmpiricalState(source, zeros, jnp.zeros((settings.score_banks, len(bank))), jnp.ones(len(zeros)))
+        # Source banks of one window of the demonstration, until there is a rollout.
+        count, size = settings.score_banks, settings.bank
+        source = jnp.broadcast_to(windows[0], (count, size, windows.shape[-1]))
+        zeros = jnp.zeros((count, size))
+        return EmpiricalState(bank_rows(key, len(windows), size), source, zeros, zeros, jnp.ones(count))
 
     def score(state: EmpiricalState, x):
-        to_expert = transport.squared_cost(x, bank)  # of every bank
+        to_expert = transport.squared_cost(x, windows[state.bank])  # in every source bank's score
 
         def one(total, solved):
             source, self_dual, expert_dual, epsilon = solved
@@ -51,19 +53,20 @@ def make(expert: Expert, config: Config) -> MotionPrior:
             source_value, _ = transport.extension(transport.squared_cost(x, source), self_dual, epsilon)
             return total + expert_value - source_value, None
 
-        total, _ = jax.lax.scan(one, jnp.zeros(x.shape[:1]), state)
+        total, _ = jax.lax.scan(one, jnp.zeros(x.shape[:1]), state[1:])
         return total / len(state.epsilon)
 
     def update(state: EmpiricalState, rollout: Rollout, key):
         steps, count, size = rollout.features.shape
-        pool = jnp.where(rollout.valid[..., None], rollout.features, bank[0]).reshape(-1, size)
+        bank = windows[state.bank]
+        pool = jnp.where(rollout.valid[..., None], rollout.features, windows[0]).reshape(-1, size)
 
         def one(key):
             source = pool[jax.random.randint(key, (settings.bank,), 0, len(pool))]
-            solution = solve(source)
-            return EmpiricalState(source, solution.self_dual, solution.expert_dual, solution.epsilon), solution
+            return source, solve(source, bank)
 
-        state, solutions = jax.lax.map(one, jax.random.split(key, settings.score_banks))
+        source, solutions = jax.lax.map(one, jax.random.split(key, settings.score_banks))
+        state = EmpiricalState(state.bank, source, solutions.self_dual, solutions.expert_dual, solutions.epsilon)
         result = median_reward(score(state, pool).reshape(steps, count), rollout.valid, settings.spread_floor)
         summary = {
             "score_median": result.median,

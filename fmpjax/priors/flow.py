@@ -14,12 +14,13 @@ import optax
 
 from fmpjax import potential, transport
 from fmpjax.config import Config, PriorConfig
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, median_reward
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, bank_rows, median_reward
 
 
 class FlowState(NamedTuple):
     """State of the prior between rollouts."""
 
+    bank: jax.Array  # [m] int32, rows of the demonstration's windows: E of the paper, drawn once
     params: potential.Params
     optimizer: optax.OptState
     average: potential.Params  # averaged over the last rollout's updates; it scores
@@ -125,34 +126,35 @@ def losses(params, query, teacher: Teacher, flow: Flow, dimension, config: Prior
 
 def make(expert: Expert, config: Config) -> MotionPrior:
     """FMP: all three losses."""
-    return _make(expert.bank, expert.dimension, config.prior)
+    return _make(expert, config.prior)
 
 
 def make_endpoint(expert: Expert, config: Config) -> MotionPrior:
     """Endpoint: FMP without the flow loss, everything else the same."""
-    return _make(expert.bank, expert.dimension, dataclasses.replace(config.prior, flow_weight=0.0))
+    return _make(expert, dataclasses.replace(config.prior, flow_weight=0.0))
 
 
 def make_value(expert: Expert, config: Config) -> MotionPrior:
     """Value: FMP without the flow and the endpoint loss, everything else the same."""
     changed = dataclasses.replace(config.prior, flow_weight=0.0, endpoint_weight=0.0)
-    return _make(expert.bank, expert.dimension, changed)
+    return _make(expert, changed)
 
 
-def _make(expert_bank: jax.Array, dimension: float, config: PriorConfig) -> MotionPrior:
-    """The prior for an expert bank ``[m, D]`` of features that stand for ``dimension`` coordinates."""
+def _make(expert: Expert, config: PriorConfig) -> MotionPrior:
+    windows, dimension = expert.windows, expert.dimension
     optimizer = optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.adam(config.learning_rate))
     # Weight of the newest parameters such that an update's share halves after `average_half_life` updates.
     newest = 1.0 - 0.5 ** (1.0 / config.average_half_life)
 
     def init(key):
-        params = potential.init(key, expert_bank.shape[-1], dimension, config.hidden)
-        return FlowState(params, optimizer.init(params), params)
+        bank_key, key = jax.random.split(key)
+        params = potential.init(key, windows.shape[-1], dimension, config.hidden)
+        return FlowState(bank_rows(bank_key, len(windows), config.bank), params, optimizer.init(params), params)
 
     def score(state: FlowState, x):
         return potential.score(state.average, x, dimension)
 
-    def fit_once(carry, key, pool, query_pool):
+    def fit_once(carry, key, expert_bank, pool, query_pool):
         params, optimizer_state, average = carry
         bank_key, query_key, flow_key = jax.random.split(key, 3)
         source = pool[jax.random.randint(bank_key, (config.bank,), 0, len(pool))]
@@ -184,16 +186,17 @@ def _make(expert_bank: jax.Array, dimension: float, config: PriorConfig) -> Moti
     def update(state: FlowState, rollout: Rollout, key):
         steps, count, size = rollout.features.shape
         # A window that is not finite is replaced by the first expert window: it neither spreads nor is rewarded.
-        features = jnp.where(rollout.valid[..., None], rollout.features, expert_bank[0])
+        expert_bank = windows[state.bank]
+        features = jnp.where(rollout.valid[..., None], rollout.features, windows[0])
         pool = features.reshape(-1, size)
         query_count = max(1, int(config.query_share * count))
         query_pool = pool if query_count == count else features[:, :query_count].reshape(-1, size)
         carry, metrics = jax.lax.scan(
-            lambda carry, key: fit_once(carry, key, pool, query_pool),
+            lambda carry, key: fit_once(carry, key, expert_bank, pool, query_pool),
             (state.params, state.optimizer, state.params),
             jax.random.split(key, config.updates),
         )
-        state = FlowState(*carry)
+        state = FlowState(state.bank, *carry)
         scores = score(state, pool).reshape(steps, count)
         result = median_reward(scores, rollout.valid, config.spread_floor)
         summary = {name: values.mean() for name, values in metrics.items()}

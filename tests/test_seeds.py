@@ -1,0 +1,104 @@
+"""Several seeds trained at once, as one program: the same runs as alone, each in its folder."""
+
+import csv
+import shutil
+
+import numpy as np
+import pytest
+from test_train import TINY, settings, tiny
+
+from fmpjax import cli, runs
+from fmpjax.checkpoint import Checkpoints
+from fmpjax.errors import UserError
+
+pytestmark = pytest.mark.slow
+
+
+def rows(folder):
+    with (folder / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def group(tmp_path_factory):
+    """Seeds 3 and 4, begun by the command line and stopped by their time budget after the first chunk."""
+    folder = tmp_path_factory.mktemp("seeds") / "group"
+    cli.main(
+        ["train", "--preset", "smoke", *settings(TINY), "--seed", "3", "--seeds", "2", "--run", str(folder),
+         "--minutes", "0.0001"]
+    )  # fmt: skip
+    return folder
+
+
+def test_each_seed_is_a_run_of_its_own(group):
+    for seed in (3, 4):
+        run = runs.Run.open(group / f"seed{seed}")
+        assert run.config == tiny(seed=seed)
+        assert Checkpoints(run.folder).latest() == 2
+        assert (run.folder / "evaluation.json").exists()
+        assert (run.folder / "policy.mp4").exists() or (run.folder / "policy.gif").exists()
+
+
+def test_seeds_at_once_are_the_seeds_alone(group, tmp_path):
+    """To rounding: batched products are summed in another order, which contacts make larger within the chunk."""
+    alone = runs.Run.create(tmp_path / "alone", tiny(seed=4))
+    runs.train(alone, minutes=1e-6)
+    one, other, neighbour = rows(alone.folder)[0], rows(group / "seed4")[0], rows(group / "seed3")[0]
+    close = [k for k in one if k.startswith(("train/", "fit/", "ppo/")) and one[k]]
+    assert len(close) > 20
+    for name in close:
+        assert float(other[name]) == pytest.approx(float(one[name]), rel=2e-2, abs=2e-3), name
+    assert abs(float(one["fit/epsilon"]) / float(neighbour["fit/epsilon"]) - 1) > 1e-4
+    trainer = alone.trainer()
+    states = [Checkpoints(f).restore(trainer.init()) for f in (alone.folder, group / "seed4", group / "seed3")]
+    np.testing.assert_array_equal(states[0].prior.bank, states[1].prior.bank)
+    np.testing.assert_array_equal(states[0].key, states[1].key)
+    assert np.any(np.asarray(states[0].prior.bank) != np.asarray(states[2].prior.bank))
+
+
+def test_a_group_goes_on_from_what_all_its_seeds_have(group, tmp_path, monkeypatch, capsys):
+    """A kill between two saves leaves one seed ahead of the other: both go on from the older of the two."""
+    folder = tmp_path / "group"
+    shutil.copytree(group, folder)
+    monkeypatch.setattr(runs, "_SAVE_INTERVAL", 0.0)
+    cli.main(["train", "--resume", "--run", str(folder)])
+    shutil.rmtree(folder / "seed3" / "checkpoints" / "10")
+    before = {seed: rows(folder / f"seed{seed}") for seed in (3, 4)}
+    assert [int(r["iteration"]) for r in before[3]] == [2, 4, 6, 8, 10]
+    capsys.readouterr()
+    cli.main(["train", "--resume", "--run", str(folder), "--seeds", "2"])
+    assert "1,280" not in capsys.readouterr().out  # each seed has a budget of its own, 640
+    for seed in (3, 4):
+        again = rows(folder / f"seed{seed}")
+        for row, old in zip(again, before[seed], strict=True):
+            assert {k: v for k, v in row.items() if k != "seconds"} == {k: v for k, v in old.items() if k != "seconds"}
+        assert Checkpoints(folder / f"seed{seed}").latest() == 10
+
+
+def test_one_seed_of_a_group_goes_on_alone(group, tmp_path):
+    folder = tmp_path / "group"
+    shutil.copytree(group, folder)
+    cli.main(["train", "--resume", "--run", str(folder), "--seed", "4", "--minutes", "0.0001"])
+    assert [len(rows(folder / f"seed{seed}")) for seed in (3, 4)] == [1, 2]
+
+
+def test_runs_that_differ_in_more_are_refused(tmp_path):
+    one = runs.Run.create(tmp_path / "a", tiny(seed=0))
+    other = runs.Run.create(tmp_path / "b", tiny(seed=1, **{"ppo.discount": 0.5}))
+    with pytest.raises(UserError, match=r"b has ppo.discount 0.5 and run .*a 0.97: runs that train at once differ in"):
+        runs.train(one, other)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--seeds", "0"], "--seeds is 0: expected at least 1"),
+        (["--resume", "--run", "GROUP", "--seeds", "3"], "has 2 seeds: it cannot go on with 3"),
+        (["--resume", "--run", "GROUP", "--seed", "9"], "seed9 is not a run folder"),
+    ],
+)
+def test_bad_seeds(group, capsys, arguments, message):
+    with pytest.raises(SystemExit) as exit_info:
+        cli.main(["train", *(word.replace("GROUP", str(group)) for word in arguments)])
+    assert exit_info.value.code == 2
+    assert message in capsys.readouterr().err
