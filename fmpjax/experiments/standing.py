@@ -124,7 +124,8 @@ def gradients(trainer: Trainer, state: TrainState, moments: Moments) -> dict[str
     center = moments.survival.mean() / (1.0 - config.discount)
 
     def gradient(advantage, batch):
-        gain = (advantage - advantage.mean()) / advantage.std()
+        # Where nobody falls, survival has no advantage anywhere.
+        gain = (advantage - advantage.mean()) / jnp.maximum(advantage.std(), 1e-5)
 
         def surrogate(actor):
             mean, deviation = trainer.ppo.policy(actor, state.ppo.normalizer, batch.observation)
@@ -152,7 +153,7 @@ def gradients(trainer: Trainer, state: TrainState, moments: Moments) -> dict[str
     survival = per_rollout(moments.survival, flat, flat)
 
     def agreement(a):
-        unit = a / jnp.linalg.norm(a, axis=-1, keepdims=True)
+        unit = a / jnp.maximum(jnp.linalg.norm(a, axis=-1, keepdims=True), 1e-12)
         pairs = unit @ unit.T
         return (pairs.sum() - len(a)) / (len(a) * (len(a) - 1))
 
@@ -160,7 +161,7 @@ def gradients(trainer: Trainer, state: TrainState, moments: Moments) -> dict[str
     G, L = (_returns(reward, moments.batch, config.discount).ravel() for reward in (moments.reward, moments.survival))
     return {
         "gradient_agreement": agreement(learned),  # cosine of the gradients of two independent rollouts
-        "gradient_survival_cosine": a @ b / (jnp.linalg.norm(a) * jnp.linalg.norm(b)),
+        "gradient_survival_cosine": a @ b / jnp.maximum(jnp.linalg.norm(a) * jnp.linalg.norm(b), 1e-12),
         "return_survival_share": jnp.corrcoef(G, L)[0, 1] ** 2,
         "critic_explained_variance": 1.0 - jnp.var(G - value.ravel()) / jnp.var(G),
     }
