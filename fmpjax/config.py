@@ -51,6 +51,7 @@ class FeatureConfig:
 
     history: int = 10  # frames in a window, H [P]
     deviation_floor: float = 1e-4  # least standard deviation of a coordinate when standardising [M]
+    angular_velocity_floor: float = 1e-4  # rad/s, the same of the joints' and the root's angular velocities [M]
     clip: float = 10.0  # standardised coordinates are clipped to this magnitude [P]
 
 
@@ -193,6 +194,7 @@ _LAPTOP: dict[str, Any] = {
     "env.observation": "compact",
     "env.action": "residual",
     "features.deviation_floor": 0.05,
+    "features.angular_velocity_floor": 0.05,
     "prior.updates": 3,
     "prior.query_share": 1.0,
     "prior.query_is_bank": True,
@@ -322,9 +324,10 @@ _CHOICES = {
 }
 _POSITIVE = (
     "transitions env.count env.episode_steps env.first_cap ppo.rollout_steps physics.timestep physics.substeps "
-    "features.deviation_floor features.clip prior.bank prior.minibatch prior.updates prior.learning_rate "
-    "ppo.learning_rate ppo.deviation chunk evaluation_episodes prior.spread_floor prior.value_scale env.last_cap "
-    "prior.score_banks prior.temperature amp.updates amp.minibatch amp.replay amp.replay_new amp.learning_rate"
+    "features.deviation_floor features.angular_velocity_floor features.clip prior.bank prior.minibatch "
+    "prior.updates prior.learning_rate ppo.learning_rate ppo.deviation chunk evaluation_episodes "
+    "prior.spread_floor prior.value_scale env.last_cap prior.score_banks prior.temperature amp.updates "
+    "amp.minibatch amp.replay amp.replay_new amp.learning_rate"
 ).split()
 
 

@@ -218,9 +218,12 @@ def fit_feature_map(robot: Robot, windows: jax.Array, config: FeatureConfig) -> 
     """Feature map from the demonstration's windows of compact frames ``[W, H, F]``."""
     dimension = config.history * frame_size(robot)
     relative = np.asarray(relative_windows(windows), np.float64)
+    floor = np.full(relative.shape[-1], config.deviation_floor)
+    # The last coordinates of a frame: the root's angular velocity, then the joints'.
+    floor[-(3 + robot.joint_count) :] = config.angular_velocity_floor
     return FeatureMap(
         mean=jnp.asarray(relative.mean(0), jnp.float32),
-        deviation=jnp.asarray(np.maximum(relative.std(0), config.deviation_floor), jnp.float32),
+        deviation=jnp.asarray(np.maximum(relative.std(0), floor), jnp.float32),
         weight=jnp.asarray(compact_weights(robot) / np.sqrt(dimension), jnp.float32),
         clip=jnp.float32(config.clip),
         dimension=jnp.float32(dimension),

@@ -182,7 +182,9 @@ def test_compact_features_have_the_distances_of_the_full_ones(robot, case, floor
     count = case["count"]
     with jax.enable_x64(case["dtype"] == np.float64):
         frames = jnp.asarray(case["frames"])
-        feature_map = features.fit_feature_map(robot, frames[:count], FeatureConfig(deviation_floor=floor))
+        feature_map = features.fit_feature_map(
+            robot, frames[:count], FeatureConfig(deviation_floor=floor, angular_velocity_floor=floor)
+        )
         compact = np.asarray(feature_map(frames), np.float64)
     full, clipped = full_features(case["full"].astype(np.float64), case["full"][:count].astype(np.float64), floor)
     assert compact.shape == (3 * count, 1170) and full.shape == (3 * count, FULL)
@@ -202,7 +204,9 @@ def test_statistics_are_the_demonstrations(robot, case):
     relative[..., :2] -= frames[:, -1:, :2]
     with jax.enable_x64(case["dtype"] == np.float64):
         fitted = features.fit_feature_map(
-            robot, jnp.asarray(case["frames"][:count]), FeatureConfig(deviation_floor=floor)
+            robot,
+            jnp.asarray(case["frames"][:count]),
+            FeatureConfig(deviation_floor=floor, angular_velocity_floor=floor),
         )
         again = np.asarray(fitted(jnp.asarray(case["frames"])))
         of_relative = np.asarray(fitted(jnp.asarray(relative, case["dtype"])))
@@ -223,7 +227,9 @@ def test_statistics_are_the_demonstrations(robot, case):
 
 def test_features_ignore_where_on_the_floor_the_window_is(robot, case):
     frames = case["frames"].astype(np.float32)
-    fitted = features.fit_feature_map(robot, jnp.asarray(frames[: case["count"]]), FeatureConfig(deviation_floor=0.05))
+    fitted = features.fit_feature_map(
+        robot, jnp.asarray(frames[: case["count"]]), FeatureConfig(deviation_floor=0.05, angular_velocity_floor=0.05)
+    )
     shift = np.zeros(frames.shape[-1], np.float32)
     shift[:2] = [2.0, -1.0]
     np.testing.assert_allclose(fitted(jnp.asarray(frames + shift)), fitted(jnp.asarray(frames)), atol=1e-5)
@@ -243,3 +249,16 @@ def test_float64_agrees_to_rounding(observe, reference):
     # The reference was computed in float64.
     np.testing.assert_allclose(observed["window"], reference["prior_window"], atol=1e-6)
     np.testing.assert_allclose(observed["actor"][:, -1], reference["actor_obs"], atol=1e-6)
+
+
+def test_angular_velocities_have_a_floor_of_their_own(robot, walk):
+    """Joint velocities and the root's angular velocity, the last 3 + J coordinates, and nothing else."""
+    frames = features.observe(robot, jnp.asarray(walk.qpos[:40]), jnp.asarray(walk.qvel[:40]), "compact").frame
+    windows = frames[np.arange(30)[:, None] + np.arange(10)]
+    plain = features.fit_feature_map(robot, windows, FeatureConfig())
+    raised = features.fit_feature_map(robot, windows, FeatureConfig(angular_velocity_floor=0.5))
+    cut = -(3 + robot.joint_count)
+    np.testing.assert_array_equal(raised.deviation[:, :cut], plain.deviation[:, :cut])
+    np.testing.assert_array_equal(raised.deviation[:, cut:], np.maximum(plain.deviation[:, cut:], 0.5))
+    assert (np.asarray(plain.deviation[:, cut:]) < 0.5).any()
+    assert (np.asarray(plain.deviation[:, cut:]) > 0.5).any()

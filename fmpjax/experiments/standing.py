@@ -199,6 +199,11 @@ def reference(pool: jax.Array, expert: jax.Array, query: jax.Array, trainer: Tra
     return Reference(score.mean(0), gradient.mean(0))
 
 
+def deviations(trainer: Trainer) -> jax.Array:
+    """The demonstration's own deviations ``[H, F]``, before any floor."""
+    return features.relative_windows(trainer.env.clip_windows()).std(0)
+
+
 def fits(trainer: Trainer, state: TrainState, moments: Moments, key: jax.Array) -> dict[str, jax.Array]:
     """How the fitted potential, and one fitted 128 times more to the same windows, follow the transport."""
     config, dimension = trainer.config.prior, trainer.feature_map.dimension
@@ -235,7 +240,7 @@ def fits(trainer: Trainer, state: TrainState, moments: Moments, key: jax.Array) 
     for name, size in _groups(trainer.robot).items():
         row[f"gradient_share_{name}"] = frame[..., start : start + size].sum() / weight.sum()
         start += size
-    floored = trainer.feature_map.deviation <= trainer.config.features.deviation_floor * (1 + 1e-6)
+    floored = trainer.feature_map.deviation > deviations(trainer) * (1 + 1e-5)
     row["floored_coordinates"] = floored.mean()
     row["gradient_share_floored"] = (frame * floored).sum() / weight.sum()
     limit = trainer.feature_map.clip * jnp.tile(trainer.feature_map.weight, trainer.env.horizon)
