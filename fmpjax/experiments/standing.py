@@ -12,7 +12,7 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -291,7 +291,7 @@ def measure(
     seed: int = 0,
     transitions: int = 6_000_000,
     every: int = 500_000,
-    set: tuple[str, ...] = (),  # noqa: A002 - the option's name
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),  # noqa: A002 - the option's name
 ) -> None:
     """Train, and look at the run every so often.
 
@@ -303,7 +303,7 @@ def measure(
       seed: of the run.
       transitions: of the run.
       every: transitions between two measurements.
-      set: any other setting as section.field=value.
+      set: any other setting as section.field=value, repeated.
     """
     changes = dict(item.partition("=")[::2] for item in set)
     config: Config = preset(preset_name, motion=motion, frames=frames, seed=seed, transitions=transitions, **changes)
