@@ -168,7 +168,7 @@ def curves(rows: Sequence[Row], paths: Sequence[Path]) -> None:
     grid = figure.subplots(len(resets), len(panels), squeeze=False, sharex=True)
     handles = {}
     for line, reset in zip(grid, resets, strict=True):
-        for panel, (key, title) in zip(line, panels, strict=True):
+        for panel, (key, heading) in zip(line, panels, strict=True):
             for index, (method, variant) in enumerate(labels):
                 chosen = [r for r in rows if (r.reset, r.method, r.variant) == (reset, method, variant)]
                 name = title(method, variant)
@@ -183,7 +183,7 @@ def curves(rows: Sequence[Row], paths: Sequence[Path]) -> None:
                 (handles[name],) = panel.plot(
                     np.array(stops) / 1e6, means, color=f"C{index}", linewidth=1.8, marker="o", markersize=3
                 )
-            panel.set_title(f"{reset} reset: {title}", fontsize=9, loc="left")
+            panel.set_title(f"{reset} reset: {heading}", fontsize=9, loc="left")
             panel.tick_params(labelsize=7, length=2)
             panel.grid(alpha=0.25, linewidth=0.5)
             panel.spines[["top", "right"]].set_visible(False)
