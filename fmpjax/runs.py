@@ -324,9 +324,12 @@ def provenance() -> dict[str, object]:
         except (OSError, subprocess.SubprocessError):
             return None
 
+    # `python -m fmpjax.experiments.NAME` leaves the module's file as the program's name.
+    program = Path(sys.argv[0])
+    name = f"python -m fmpjax.experiments.{program.stem}" if program.parent.name == "experiments" else "fmpjax"
     changes = git("status", "--porcelain", "--untracked-files=no")
     return {
-        "command": shlex.join(["fmpjax", *sys.argv[1:]]),
+        "command": f"{name} {shlex.join(sys.argv[1:])}",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": git("rev-parse", "HEAD"),
         "uncommitted_changes": None if changes is None else bool(changes),
