@@ -176,7 +176,8 @@ class Config:
 # - an episode cap that grows from 64 steps to 150, a time-out being no end: docs/learning.md says what either does;
 # - discount 0.97: a median-centred reward pays one a step for mere survival, worth 1/(1 - gamma);
 # - three reward updates a rollout of 4,096: the reward changes little between so small rollouts;
-# - feature deviations floored at 0.05: coordinates that the demonstration hardly moves would carry the distance;
+# - feature deviations floored at 0.05, those of angular velocities at 0.5 rad/s: coordinates that the demonstration
+#   hardly moves would carry the distance;
 # - Adam with a rate that follows the KL divergence, small networks, learned deviation: sample efficiency.
 _LAPTOP: dict[str, Any] = {
     "transitions": 14_000_000,
@@ -194,7 +195,7 @@ _LAPTOP: dict[str, Any] = {
     "env.observation": "compact",
     "env.action": "residual",
     "features.deviation_floor": 0.05,
-    "features.angular_velocity_floor": 0.05,
+    "features.angular_velocity_floor": 0.5,
     "prior.updates": 3,
     "prior.query_share": 1.0,
     "prior.query_is_bank": True,
