@@ -1,7 +1,6 @@
 """Several seeds trained at once, as one program: the same runs as alone, each in its folder."""
 
 import csv
-import shutil
 
 import numpy as np
 import pytest
@@ -54,32 +53,6 @@ def test_seeds_at_once_are_the_seeds_alone(group, tmp_path):
     np.testing.assert_array_equal(states[0].prior.bank, states[1].prior.bank)
     np.testing.assert_array_equal(states[0].key, states[1].key)
     assert np.any(np.asarray(states[0].prior.bank) != np.asarray(states[2].prior.bank))
-
-
-def test_a_group_goes_on_from_what_all_its_seeds_have(group, tmp_path, monkeypatch, capsys):
-    """A kill between two saves leaves one seed ahead of the other: both go on from the older of the two."""
-    folder = tmp_path / "group"
-    shutil.copytree(group, folder)
-    monkeypatch.setattr(runs, "_SAVE_INTERVAL", 0.0)
-    cli.main(["train", "--resume", "--run", str(folder)])
-    shutil.rmtree(folder / "seed3" / "checkpoints" / "10")
-    before = {seed: rows(folder / f"seed{seed}") for seed in (3, 4)}
-    assert [int(r["iteration"]) for r in before[3]] == [2, 4, 6, 8, 10]
-    capsys.readouterr()
-    cli.main(["train", "--resume", "--run", str(folder), "--seeds", "2"])
-    assert "1,280" not in capsys.readouterr().out  # each seed has a budget of its own, 640
-    for seed in (3, 4):
-        again = rows(folder / f"seed{seed}")
-        for row, old in zip(again, before[seed], strict=True):
-            assert {k: v for k, v in row.items() if k != "seconds"} == {k: v for k, v in old.items() if k != "seconds"}
-        assert Checkpoints(folder / f"seed{seed}").latest() == 10
-
-
-def test_one_seed_of_a_group_goes_on_alone(group, tmp_path):
-    folder = tmp_path / "group"
-    shutil.copytree(group, folder)
-    cli.main(["train", "--resume", "--run", str(folder), "--seed", "4", "--minutes", "0.0001"])
-    assert [len(rows(folder / f"seed{seed}")) for seed in (3, 4)] == [1, 2]
 
 
 def test_runs_that_differ_in_more_are_refused(tmp_path):
