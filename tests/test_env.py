@@ -65,7 +65,7 @@ CLIP = motion.load("walk")
 
 @functools.cache
 def make(**changes):
-    changes = {"count": COUNT, "first_cap": 500} | changes
+    changes = {"count": COUNT, "first_cap": 500, "last_cap": 500} | changes
     built = Env(ROBOT, CLIP, preset("smoke", **{f"env.{k}": v for k, v in changes.items()}), FakePhysics())
     # Targets are the actions themselves, so that the fake physics reads its commands.
     ones = np.ones(JOINTS, np.float32)
