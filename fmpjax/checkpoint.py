@@ -17,9 +17,9 @@ from fmpjax.train import TrainState
 KEEP = 3  # last checkpoints kept
 
 
-def _flatten(state: TrainState) -> dict[str, jax.Array]:
+def _flatten(state: TrainState) -> dict[str, np.ndarray]:
     leaves, _ = jax.tree_util.tree_flatten_with_path(state)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    return {jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf) for path, leaf in leaves}
 
 
 class Checkpoints:
@@ -29,8 +29,16 @@ class Checkpoints:
         self.run = Path(run).resolve()
 
     def _manager(self, kind: str, keep: int) -> ocp.CheckpointManager:
-        options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
-        return ocp.CheckpointManager(self.run / kind, options=options)
+        # Of several processes each reads for itself, and the first alone writes: none waits for another.
+        alone = ocp.options.MultiprocessingOptions(
+            primary_host=jax.process_index(), active_processes={jax.process_index()}
+        )
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=keep, create=False, enable_async_checkpointing=False, multiprocessing_options=alone
+        )
+        folder = self.run / kind
+        folder.mkdir(parents=True, exist_ok=True)
+        return ocp.CheckpointManager(folder, options=options)
 
     def save(self, state: TrainState, *, best: bool = False) -> None:
         """Write the state under its iteration's number."""
@@ -61,7 +69,7 @@ class Checkpoints:
             raise UserError(f"run {self.run} has no checkpoint in {kind}/: expected one, train it first")
         folder = self.run / kind / str(step)
         try:
-            with ocp.CheckpointManager(self.run / kind) as manager:
+            with self._manager(kind, KEEP) as manager:
                 saved = manager.restore(step, args=ocp.args.StandardRestore())
         except Exception as error:  # orbax and tensorstore raise many kinds for a damaged folder
             cause = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__

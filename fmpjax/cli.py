@@ -41,6 +41,16 @@ class Train:
     """Folder of the run, runs/METHOD-DATE-TIME by default."""
     minutes: float | None = None
     """Time budget: the run ends cleanly and can be resumed."""
+    devices: int = 1
+    """Devices that share the environments, or the seeds; 0 for every one that JAX sees."""
+    distributed: bool = False
+    """One of several processes that train together on all their devices, as SLURM starts them; see docs/scaling.md."""
+    coordinator: str | None = None
+    """HOST:PORT of the first process, where no scheduler tells it."""
+    processes: int | None = None
+    """Number of processes, likewise."""
+    process: int | None = None
+    """Number of this process, from 0, likewise."""
     resume: bool = False
     """Go on with the run in --run."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
@@ -51,14 +61,38 @@ class Train:
             raise UserError(f"--minutes is {self.minutes:g}: expected more than 0")
         if self.seeds is not None and self.seeds < 1:
             raise UserError(f"--seeds is {self.seeds}: expected at least 1")
+        if self.devices < 0:
+            raise UserError(f"--devices is {self.devices}: expected 0 (for all) or more")
+        self._connect()
         runs = _runs()
-        group = self._resumed() if self.resume else self._created()
-        end = runs.train(*group, resume=self.resume, minutes=self.minutes)
+        from fmpjax import sharding
+
+        if self.resume:
+            group = self._resumed()
+        else:
+            # The first process makes the folders, the others find them.
+            group = self._created() if sharding.primary() else None
+            sharding.wait("created")
+            group = group or self._resumed()
+        devices = None if self.distributed else self.devices or None
+        end = runs.train(*group, resume=self.resume, minutes=self.minutes, devices=devices)
         # Who sends a signal wants the process to end, not to film.
-        if end is not runs.End.SIGNAL:
+        if end is not runs.End.SIGNAL and sharding.primary():
             for run in group:
                 for path in runs.finish(run):
                     print(f"wrote {path}")
+
+    def _connect(self) -> None:
+        by_hand = (self.coordinator, self.processes, self.process)
+        if not self.distributed:
+            if by_hand != (None, None, None):
+                raise UserError("--coordinator, --processes and --process go with --distributed")
+            return
+        if self.run is None:
+            raise UserError("--distributed needs the run's folder, the same for all processes: name it with --run")
+        from fmpjax import sharding
+
+        sharding.connect(*by_hand)
 
     def _resumed(self):
         runs = _runs()

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import features, physics
+from fmpjax import features, physics, sharding
 from fmpjax.config import Config
 from fmpjax.features import Observed
 from fmpjax.motion import MotionClip
@@ -21,6 +21,10 @@ from fmpjax.robots import Robot
 
 # Faster than any joint or fall of a robot of this size, rad/s or m/s: such a state has blown up.
 _VELOCITY_LIMIT = 1e3
+
+
+# Fields of `EnvState` with a leading axis of environments.
+PER_ENVIRONMENT = ("physics", "observed", "history", "age")
 
 
 class Offender(NamedTuple):
@@ -215,7 +219,7 @@ class Env:
         return self._advance(sim, action)[:3]
 
     def _advance(self, sim, action):
-        sim = self.physics.step(sim, self.actions(action))
+        sim = sharding.per_device(self.physics.step)(sim, self.actions(action))
         finite = _finite(sim)
         # Non-finite numbers must not reach the observation, not even to be discarded.
         sim = jax.tree.map(lambda x: jnp.where(finite[:, None], x, 0.0), sim)
@@ -225,9 +229,8 @@ class Env:
     def frame_table(self, state: EnvState, record: Steps) -> jax.Array:
         """Frames ``[rows, F]`` that the windows of a rollout begun in ``state`` index."""
         size = record.frame.shape[-1]
-        return jnp.concatenate(
-            [jnp.asarray(self._table.frame), state.history.reshape(-1, size), record.frame.reshape(-1, size)]
-        )
+        before, during = sharding.gather((state.history, record.frame))
+        return jnp.concatenate([jnp.asarray(self._table.frame), before.reshape(-1, size), during.reshape(-1, size)])
 
     def _grow_cap(self, state: EnvState, record: Steps) -> EnvState:
         """Raise the cap when episodes survive it (none where it starts at the full length)."""

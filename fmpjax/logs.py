@@ -14,13 +14,19 @@ _FIRST = ("iteration", "transitions", "seconds")
 
 
 class MetricsLog:
-    """``metrics.csv`` and ``tensorboard/`` of a run folder; a resumed run goes on where its checkpoint stands."""
+    """``metrics.csv`` and ``tensorboard/`` of a run folder; a resumed run goes on where its checkpoint stands.
 
-    def __init__(self, run: Path, columns: list[str], iteration: int = 0):
+    With ``keep=False`` nothing is written: another process does.
+    """
+
+    def __init__(self, run: Path, columns: list[str], iteration: int = 0, *, keep: bool = True):
+        self._keep = keep
         self._path = run / "metrics.csv"
         self._columns = [*_FIRST, *columns]
         rows = self.read(self._path) if iteration else []
         self.rows = [row for row in rows if int(row["iteration"]) <= iteration]
+        if not keep:
+            return
         # Rows beyond the checkpoint are computed again, so the file is cut back to it, by way of a new file.
         partial = self._path.with_suffix(".partial")
         with partial.open("w", newline="") as file:
@@ -40,6 +46,8 @@ class MetricsLog:
         row = {"iteration": iteration, "transitions": transitions, "seconds": f"{seconds:.2f}"}
         row |= {k: f"{v:.6g}" for k, v in values.items() if not math.isnan(v)}
         self.rows.append(row)
+        if not self._keep:
+            return
         with self._path.open("a", newline="") as file:
             csv.DictWriter(file, self._columns, extrasaction="ignore", restval="").writerow(row)
         for name, value in values.items():
@@ -48,7 +56,8 @@ class MetricsLog:
         self._board.flush()
 
     def close(self) -> None:
-        self._board.close()
+        if self._keep:
+            self._board.close()
 
     @staticmethod
     def read(path: Path) -> list[dict[str, str]]:
@@ -62,17 +71,20 @@ class MetricsLog:
 class Progress:
     """One line that follows a run: rewritten on a terminal, printed now and then into a file."""
 
-    def __init__(self, interval: float = 15.0):
-        self._terminal = sys.stdout.isatty()
+    def __init__(self, interval: float = 15.0, *, show: bool = True):
+        self._terminal, self._shown = sys.stdout.isatty(), show
         self._interval, self._last = interval, -math.inf
 
     def note(self, text: str) -> None:
         """A line that stays."""
-        print(("\r\033[K" if self._terminal else "") + text, flush=True)
+        if self._shown:
+            print(("\r\033[K" if self._terminal else "") + text, flush=True)
 
     def show(self, text: str, *, final: bool = False) -> None:
         """The progress line."""
         now = time.monotonic()
+        if not self._shown:
+            return
         if self._terminal:
             print("\r\033[K" + text, end="\n" if final else "", flush=True)
         elif final or now - self._last >= self._interval:

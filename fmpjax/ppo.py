@@ -14,6 +14,7 @@ from brax.training.acme import running_statistics
 from brax.training.types import UInt64
 from flax import linen
 
+from fmpjax import sharding
 from fmpjax.config import PPOConfig
 
 
@@ -134,7 +135,7 @@ class PPO:
         spread = jnp.maximum(advantage.std(), 1e-5)
         gain = jnp.clip((advantage - advantage.mean()) / spread, -config.advantage_clip, config.advantage_clip)
         return_variance = returns.var()
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (batch, returns, gain))
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), sharding.gather((batch, returns, gain)))
         critic_key, actor_key = jax.random.split(key)
 
         def critic_loss(params, sample):
@@ -209,7 +210,8 @@ class PPO:
 
         def descend(carry, indices):
             params, optimizer_state = carry
-            (value, stats), gradients = grad(params, jax.tree.map(lambda x: x[indices], flat))
+            sample = sharding.split(jax.tree.map(lambda x: x[indices], flat))
+            (value, stats), gradients = grad(params, sample)
             norm = optax.global_norm(gradients)
             direction, new_optimizer_state = self._optimizer.update(gradients, optimizer_state)
             new_params = jax.tree.map(lambda p, d: p - rate * d, params, direction)

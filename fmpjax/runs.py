@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from fmpjax import config as configuration
-from fmpjax import motion
+from fmpjax import motion, sharding
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import Config
 from fmpjax.errors import UserError
@@ -124,12 +124,14 @@ class End(enum.Enum):
     SIGNAL = "stopped"
 
 
-def train(*group: Run, resume: bool = False, minutes: float | None = None) -> End:
+def train(*group: Run, resume: bool = False, minutes: float | None = None, devices: int | None = 1) -> End:
     """Train a run to the end of its budget, or of its time, or until it is told to stop; all three end cleanly.
 
     Several runs that differ in nothing but their seeds are trained at once, as one program, each into its own folder.
+    Several devices, all of them for None, share the environments or the seeds.
     """
-    config, progress = group[0].config, Progress()
+    primary = sharding.primary()
+    config, progress = group[0].config, Progress(show=primary)
     began = time.monotonic()
     seeds = [run.config.seed for run in group]
     progress.note(
@@ -146,11 +148,13 @@ def train(*group: Run, resume: bool = False, minutes: float | None = None) -> En
     progress.note(f"{trainer.env.physics.name} physics on {_device_name()}; compiling, which takes a minute or so ...")
     compile_began = time.monotonic()
     state = states[0] if len(group) == 1 else stack(states)
+    if devices != 1:
+        state = trainer.place(state, sharding.mesh(devices))
     chunk = trainer.compile(state)
     progress.note(f"compiled in {time.monotonic() - compile_began:.0f} s")
     names = [f"eval/{name}" for name in _evaluation_names()]
     metric_names = sorted(jax.eval_shape(trainer.iteration, states[0])[1])
-    logs = [MetricsLog(run.folder, [*metric_names, *names], done) for run in group]
+    logs = [MetricsLog(run.folder, [*metric_names, *names], done, keep=primary) for run in group]
     milestones = _milestones(config)
     best, evaluated = [_best(log)[0] for log in logs], _best(logs[0])[1]
     training_seconds, saved = logs[0].seconds, time.monotonic()
@@ -174,15 +178,18 @@ def train(*group: Run, resume: bool = False, minutes: float | None = None) -> En
             progress.show(_line(transitions, config, rate, left, means), final=done >= config.iterations)
             for run, each in zip(group, states, strict=True):
                 _check_finite(run, each, config)
-            out_of_time = minutes is not None and time.monotonic() - began + 1.5 * took > minutes * 60
-            stopping = out_of_time or stop.requested
+            # Clocks and signals differ between processes; what follows must not.
+            out_of_time = sharding.agree(minutes is not None and time.monotonic() - began + 1.5 * took > minutes * 60)
+            asked = sharding.agree(stop.requested)
             at_milestone = any(done >= m > evaluated for m in milestones)
-            evaluating = (at_milestone or out_of_time) and not stop.requested
-            saving = evaluating or time.monotonic() - saved > _SAVE_INTERVAL
-            for i, (run, log, each, row) in enumerate(zip(group, logs, states, rows, strict=True)):
+            evaluating = (at_milestone or out_of_time) and not asked
+            saving = sharding.agree(evaluating or time.monotonic() - saved > _SAVE_INTERVAL)
+            # Before the evaluation, after which processes are no longer in step.
+            whole = [sharding.on_host(each) for each in states] if saving else []
+            for i, (run, log, row) in enumerate(zip(group, logs, rows, strict=True)):
                 better = False
                 if evaluating:
-                    evaluation, evaluated = evaluator(each.ppo), done
+                    evaluation, evaluated = evaluator(whole[i].ppo), done
                     row |= {f"eval/{name}": float(value) for name, value in evaluation.as_dict().items()}
                     which = f"seed {seeds[i]}, " if len(group) > 1 else ""
                     progress.note(f"evaluation at {transitions:,} transitions, {which}{clock(training_seconds)}:")
@@ -192,21 +199,27 @@ def train(*group: Run, resume: bool = False, minutes: float | None = None) -> En
                 log.write(done, transitions, training_seconds, row)
                 if better:
                     best[i] = evaluation.quality
-                    run.checkpoints.save(each, best=True)
+                    _save(run, whole[i], best=True)
                 if saving:
-                    run.checkpoints.save(each)
+                    _save(run, whole[i])
             saved = time.monotonic() if saving else saved
-            if stopping:
+            if out_of_time or asked:
                 break
-        for run, each in zip(group, states, strict=True):
-            run.checkpoints.save(each)
+        if not saving:
+            for run, each in zip(group, states, strict=True):
+                _save(run, sharding.on_host(each))
     for log in logs:
         log.close()
     if done >= config.iterations:
         return End.BUDGET
-    end = End.SIGNAL if stop.requested else End.TIME
+    end = End.SIGNAL if asked else End.TIME
     progress.note(f"{end.value} at {transitions:,} transitions; saved. Go on with --resume.")
     return end
+
+
+def _save(run: Run, state: TrainState, *, best: bool = False) -> None:
+    if sharding.primary():
+        run.checkpoints.save(state, best=best)
 
 
 def _shared_trainer(group: Sequence[Run]) -> Trainer:
@@ -266,9 +279,10 @@ def export(run: Run, out: Path) -> list[Path]:
     Raises:
       UserError: ``out`` holds another run's results, or cannot be written.
     """
-    # Where the demonstration lay is this machine's affair; its name is everybody's.
-    where, name = run.config.motion, Path(run.config.motion).name
-    texts = {n: (run.folder / n).read_text().replace(where, name) for n in ("config.json", "provenance.json")}
+    # Where the demonstration and the run lay is this machine's affair; their names are everybody's.
+    texts = {n: (run.folder / n).read_text() for n in ("config.json", "provenance.json")}
+    for path in (run.config.motion, str(run.folder)):
+        texts = {n: text.replace(path, Path(path).name) for n, text in texts.items()}
     if (out / "config.json").exists() and (out / "config.json").read_text() != texts["config.json"]:
         raise UserError(f"{out} holds results of another configuration: expected a new folder or this run's own")
     try:

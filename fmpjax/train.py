@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
-from fmpjax import features, physics, priors, robots
+from fmpjax import features, physics, priors, robots, sharding
 from fmpjax.config import Config
-from fmpjax.env import Env, EnvState, Steps
+from fmpjax.env import PER_ENVIRONMENT, Env, EnvState, Steps
 from fmpjax.errors import UserError
 from fmpjax.motion import MotionClip
 from fmpjax.ppo import PPO, Batch, PPOState
@@ -102,17 +103,39 @@ class Trainer:
     def compile(self, state: TrainState) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
         """The compiled program of a run: ``config.chunk`` iterations, metrics averaged over them.
 
-        A state whose leaves have a leading axis of seeds, as `stack` makes it, gives metrics with that axis.
+        A state whose leaves have a leading axis of seeds, as `stack` makes it, gives metrics with that axis. A state
+        that `place` put on a mesh stays there.
         """
 
         def chunk(state: TrainState) -> tuple[TrainState, Metrics]:
             state, metrics = jax.lax.scan(self.iteration, state, None, length=self.config.chunk)
             return state, jax.tree.map(jnp.nanmean, metrics)
 
-        chunk = jax.vmap(chunk) if state.iteration.ndim else chunk
-        chunk = jax.jit(chunk, donate_argnums=0)
+        over = sharding.of(state.iteration)
+        if state.iteration.ndim:
+            chunk = sharding.per_device(jax.vmap(chunk))
+        if over is None:
+            return jax.jit(chunk, donate_argnums=0).lower(state).compile()
+        placed = jax.tree.map(lambda leaf: leaf.sharding, state)
+        with jax.set_mesh(over):
+            shardings = (placed, sharding.everywhere(over))
+            return jax.jit(chunk, donate_argnums=0, out_shardings=shardings).lower(state).compile()
 
-        return chunk.lower(state).compile()
+    def place(self, state: TrainState, over: Mesh) -> TrainState:
+        """The state on the devices of a mesh: environments, or seeds where there are several, split over them.
+
+        Raises:
+          UserError: they do not divide.
+        """
+        devices, seeds = over.size, len(state.iteration) if state.iteration.ndim else 0
+        what, count = ("the number of seeds", seeds) if seeds else ("setting env.count", self.config.env.count)
+        if count % devices:
+            raise UserError(f"{what} is {count}: expected a multiple of {devices}, the devices that share them")
+        if seeds:
+            return jax.device_put(state, sharding.rows(over))
+        split = {name: jax.device_put(getattr(state.env, name), sharding.rows(over)) for name in PER_ENVIRONMENT}
+        state = jax.device_put(state, sharding.everywhere(over))
+        return state._replace(env=state.env._replace(**split))
 
 
 def stack(states: Sequence[TrainState]) -> TrainState:

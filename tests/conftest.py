@@ -5,6 +5,8 @@ from pathlib import Path
 
 # Before JAX is imported: the figures the tests compare are those of the CPU unless the caller says otherwise.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# Four fake devices, on which programs that several devices share are tested; everything else runs on the first.
+os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=4")
 
 import pytest
 

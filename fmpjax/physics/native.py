@@ -5,6 +5,7 @@ alone.
 """
 
 import os
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,7 @@ class NativePhysics:
         self.threads = config.threads or len(os.sched_getaffinity(0))
         self._pool = mujoco.rollout.Rollout(nthread=self.threads)
         self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
+        self._turn = threading.Lock()  # several devices call back at once; the threads serve one after another
 
     def step(self, state: PhysicsState, targets: jax.Array) -> PhysicsState:
         # One array each way: every array that crosses to the host costs tens of microseconds.
@@ -51,17 +53,18 @@ class NativePhysics:
         initial = np.zeros((count, 1 + nq + nv))
         initial[:, 1:] = packed[:, : nq + nv]
         control = np.repeat(packed[:, None, nq + 2 * nv :].astype(np.float64), self.substeps, axis=1)
-        states, _ = self._pool.rollout(
-            [self.model] * count,
-            self._data,
-            initial,
-            control,
-            initial_warmstart=packed[:, nq + nv : nq + 2 * nv].astype(np.float64),
-            nstep=self.substeps,
-            state=np.empty(shape),
-            sensordata=np.empty((count, self.substeps, self.model.nsensordata)),
-            skip_checks=True,
-        )
+        with self._turn:
+            states, _ = self._pool.rollout(
+                [self.model] * count,
+                self._data,
+                initial,
+                control,
+                initial_warmstart=packed[:, nq + nv : nq + 2 * nv].astype(np.float64),
+                nstep=self.substeps,
+                state=np.empty(shape),
+                sensordata=np.empty((count, self.substeps, self.model.nsensordata)),
+                skip_checks=True,
+            )
         before = states[:, -2] if self.substeps > 1 else initial
         reached = np.empty((count, nq + 2 * nv), packed.dtype)
         reached[:, : nq + nv] = states[:, -1, 1:]

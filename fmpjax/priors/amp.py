@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import optax
 from flax import linen
 
+from fmpjax import sharding
 from fmpjax.config import AMPConfig, Config
-from fmpjax.priors.base import Expert, MotionPrior, Rollout
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten
 
 
 class Normalizer(NamedTuple):
@@ -153,11 +154,10 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         return network.apply(state.params, normalize(state.normalizer, x))
 
     def update(state: AMPState, rollout: Rollout, key):
-        steps, count, _ = rollout.features.shape
-        pool = jnp.where(rollout.valid[..., None], rollout.features, expert.windows[0]).reshape(-1, size)
+        pool = flatten(rollout, expert.windows[0])
         order_key, expert_key, replay_key, store_key = jax.random.split(key, 4)
         logits = score(state, pool)
-        reward = reward_of(logits, settings).reshape(steps, count)
+        reward = reward_of(logits, settings).reshape(rollout.valid.shape)
         reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
 
         seen = expert.windows[jax.random.randint(expert_key, (len(pool),), 0, len(expert.windows))]
@@ -167,7 +167,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
             params, optimizer_state = carry
             rows, key = inputs
             agent_key, expert_key = jax.random.split(key)
-            current = pool[rows]
+            current = sharding.split(pool[rows])
             held = state.replay.count
             old = state.replay.windows[jax.random.randint(agent_key, rows.shape, 0, jnp.maximum(held, 1))]
             # The first rollout has nothing behind it: it is its own past.

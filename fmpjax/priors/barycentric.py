@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import transport
+from fmpjax import sharding, transport
 from fmpjax.config import Config, PriorConfig
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, bank_rows
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, bank_rows, flatten
 
 
 class BarycentricState(NamedTuple):
@@ -75,16 +75,15 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         return -scale * jnp.sum((successor - goal) ** 2, axis=-1)
 
     def update(state: BarycentricState, rollout: Rollout, key):
-        steps, count, size = rollout.features.shape
-        pool = jnp.where(rollout.valid[..., None], rollout.features, expert.windows[0]).reshape(-1, size)
+        pool = flatten(rollout, expert.windows[0])
         source_key, expert_key = jax.random.split(key)
-        source = pool[jax.random.randint(source_key, (settings.bank,), 0, len(pool))]
+        source = sharding.split(pool[jax.random.randint(source_key, (settings.bank,), 0, len(pool))])
         rows = jax.random.randint(expert_key, (settings.bank,), 0, len(expert.windows))
         condition, successor = split(expert.windows[rows], expert.horizon)
         dual, epsilon, solution = match(split(source, expert.horizon)[0], condition, expert, settings)
         state = BarycentricState(condition, successor, dual, epsilon)
         scores = score(state, pool)
-        reward = 2.0 * jnp.exp(scores).reshape(steps, count)
+        reward = 2.0 * jnp.exp(scores).reshape(rollout.valid.shape)
         reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
         _, probability = target(state, split(source, expert.horizon)[0])
         low, middle, high = jnp.quantile(scores, np.array([0.25, 0.5, 0.75]))

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from fmpjax import sharding
+
 PriorState = Any
 Metrics = Mapping[str, jax.Array]
 
@@ -36,6 +38,12 @@ class MotionPrior(NamedTuple):
     init: Callable[[jax.Array], PriorState]
     update: Callable[[PriorState, Rollout, jax.Array], tuple[PriorState, jax.Array, Metrics]]
     score: Callable[[PriorState, jax.Array], jax.Array]  # of features [n, D], higher is better, before normalisation
+
+
+def flatten(rollout: Rollout, stand_in: jax.Array) -> jax.Array:
+    """All windows of a rollout, ``[T * N, D]``; ``stand_in [D]`` takes the place of those that are not finite."""
+    features = jnp.where(rollout.valid[..., None], rollout.features, stand_in)
+    return sharding.split(features.reshape(-1, features.shape[-1]))
 
 
 def bank_rows(key: jax.Array, windows: int, size: int) -> jax.Array:

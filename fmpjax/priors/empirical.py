@@ -8,9 +8,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from fmpjax import transport
+from fmpjax import sharding, transport
 from fmpjax.config import Config
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, bank_rows, median_reward
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, bank_rows, flatten, median_reward
 
 
 class EmpiricalState(NamedTuple):
@@ -57,17 +57,16 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         return total / len(state.epsilon)
 
     def update(state: EmpiricalState, rollout: Rollout, key):
-        steps, count, size = rollout.features.shape
-        bank = windows[state.bank]
-        pool = jnp.where(rollout.valid[..., None], rollout.features, windows[0]).reshape(-1, size)
+        bank, pool = windows[state.bank], flatten(rollout, windows[0])
 
         def one(key):
-            source = pool[jax.random.randint(key, (settings.bank,), 0, len(pool))]
+            source = sharding.split(pool[jax.random.randint(key, (settings.bank,), 0, len(pool))])
             return source, solve(source, bank)
 
         source, solutions = jax.lax.map(one, jax.random.split(key, settings.score_banks))
         state = EmpiricalState(state.bank, source, solutions.self_dual, solutions.expert_dual, solutions.epsilon)
-        result = median_reward(score(state, pool).reshape(steps, count), rollout.valid, settings.spread_floor)
+        scores = score(state, pool).reshape(rollout.valid.shape)
+        result = median_reward(scores, rollout.valid, settings.spread_floor)
         summary = {
             "score_median": result.median,
             "score_spread": result.spread,

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from fmpjax import potential, transport
+from fmpjax import potential, sharding, transport
 from fmpjax.config import Config, PriorConfig
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, bank_rows, median_reward
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, bank_rows, flatten, median_reward
 
 
 class FlowState(NamedTuple):
@@ -154,14 +154,16 @@ def _make(expert: Expert, config: PriorConfig) -> MotionPrior:
     def score(state: FlowState, x):
         return potential.score(state.average, x, dimension)
 
-    def fit_once(carry, key, expert_bank, pool, query_pool):
+    def fit_once(carry, key, expert_bank, pool, count):
         params, optimizer_state, average = carry
         bank_key, query_key, flow_key = jax.random.split(key, 3)
-        source = pool[jax.random.randint(bank_key, (config.bank,), 0, len(pool))]
+        source = sharding.split(pool[jax.random.randint(bank_key, (config.bank,), 0, len(pool))])
         if config.query_is_bank:
             query, teacher = source, teach(source, expert_bank, None, dimension, config)
         else:
-            query = query_pool[jax.random.randint(query_key, (config.minibatch,), 0, len(query_pool))]
+            querying = max(1, int(config.query_share * count))  # the first environments supply the queries
+            pick = jax.random.randint(query_key, (config.minibatch,), 0, len(pool) // count * querying)
+            query = sharding.split(pool[pick // querying * count + pick % querying])
             teacher = teach(source, expert_bank, query, dimension, config)
         flow = sample_flow(flow_key, query, teacher, source, expert_bank)
         (total, stats), gradients = jax.value_and_grad(losses, has_aux=True)(
@@ -184,21 +186,16 @@ def _make(expert: Expert, config: PriorConfig) -> MotionPrior:
         return (params, optimizer_state, average), metrics
 
     def update(state: FlowState, rollout: Rollout, key):
-        steps, count, size = rollout.features.shape
         # A window that is not finite is replaced by the first expert window: it neither spreads nor is rewarded.
         expert_bank = windows[state.bank]
-        features = jnp.where(rollout.valid[..., None], rollout.features, windows[0])
-        pool = features.reshape(-1, size)
-        query_count = max(1, int(config.query_share * count))
-        query_pool = pool if query_count == count else features[:, :query_count].reshape(-1, size)
+        pool, shape = flatten(rollout, windows[0]), rollout.valid.shape
         carry, metrics = jax.lax.scan(
-            lambda carry, key: fit_once(carry, key, expert_bank, pool, query_pool),
+            lambda carry, key: fit_once(carry, key, expert_bank, pool, shape[1]),
             (state.params, state.optimizer, state.params),
             jax.random.split(key, config.updates),
         )
         state = FlowState(state.bank, *carry)
-        scores = score(state, pool).reshape(steps, count)
-        result = median_reward(scores, rollout.valid, config.spread_floor)
+        result = median_reward(score(state, pool).reshape(shape), rollout.valid, config.spread_floor)
         summary = {name: values.mean() for name, values in metrics.items()}
         for name in ("unconverged", "skipped"):
             summary[name] = metrics[name].sum()
