@@ -18,9 +18,10 @@ from fmpjax import rotations
 from fmpjax.errors import UserError
 
 CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
-MOST_BYTES = 1 << 29
+MOST_BYTES = 1 << 27
 MOST_CHARACTERS = 1 << 20  # of a line
 MOST_JOINTS = 1000
+MOST_POSES = 20_000_000  # joints times frames
 LARGEST = 1e9
 _CHANNEL = {name.lower(): i for i, name in enumerate(CHANNELS)}
 
@@ -69,6 +70,11 @@ def read(path: str | os.PathLike) -> Bvh:
         raise UserError(f"{file}: no line MOTION, expected one after the joints; the file may be cut short")
     names, parent, offset, channels = _hierarchy(file, lines[:start])
     rate, values = _motion(file, lines, start + 1, sum(map(len, channels)))
+    if len(values) * len(names) > MOST_POSES:
+        raise UserError(
+            f"{file}: {len(values)} frames of {len(names)} joints are {len(values) * len(names)} poses, "
+            f"expected at most {MOST_POSES}"
+        )
     return Bvh(names, parent, offset, channels, rate, values)
 
 
