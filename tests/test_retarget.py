@@ -32,8 +32,8 @@ for prefix, short in (("Left", "l"), ("Right", "r")):
         CMU[prefix + name] = short + cmu
 
 
-def capture(robot, clip, *, unit=100.0, names=None, axes_wxyz=IDENTITY):
-    """BVH text, y up, of a skeleton whose joints are the robot's landmarks; ``axes_wxyz`` renames the joints' axes."""
+def capture(robot, clip, *, unit=100.0, names=None, axes_wxyz=IDENTITY, arms=1.0):
+    """BVH text, y up, of the robot's landmarks as joints; ``axes_wxyz`` renames their axes, ``arms`` stretches arms."""
     data = mujoco.MjData(robot.model)
     position, rotation_wxyz = ({joint: np.zeros((len(clip), size)) for joint in TREE} for size in (3, 4))
     for t, row in enumerate(clip.qpos):
@@ -53,6 +53,7 @@ def capture(robot, clip, *, unit=100.0, names=None, axes_wxyz=IDENTITY):
             inverse = rotations.conjugate(rotation_wxyz[parent])
             at = rotations.rotate(inverse, at - position[parent])
             turned = rotations.multiply(inverse, turned)
+            at = at * (arms if joint.endswith(("ForeArm", "Hand")) else 1.0)
         columns.extend([at, Rotation.from_quat(turned[:, [1, 2, 3, 0]]).as_euler("ZYX", degrees=True)])
         lines.append(f"{'JOINT' if parent else 'ROOT'} {(names or {}).get(joint, joint)} {{ OFFSET 0 0 0")
         lines.append("CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation")
@@ -127,9 +128,9 @@ def test_feet_stay_on_the_floor(robot, second, done):
     assert (touch == done.contact).mean() > 0.9
 
 
-def test_names_units_and_axes_do_not_matter(robot, second, read, done):
-    """CMU's names, inches, and joints whose x axis points up the spine."""
-    text = capture(robot, second, unit=1 / 0.0254, names=CMU, axes_wxyz=np.array([0.5, 0.5, 0.5, 0.5]))
+def test_names_units_axes_and_lengths_of_arms_do_not_matter(robot, second, read, done):
+    """CMU's names, inches, joints whose x axis points up the spine, and longer arms."""
+    text = capture(robot, second, unit=1 / 0.0254, names=CMU, axes_wxyz=np.array([0.5, 0.5, 0.5, 0.5]), arms=1.4)
     again = retarget.retarget(read(text), robot, "walk")
     assert again.scale == pytest.approx(0.0254, rel=1e-3)
     np.testing.assert_allclose(again.clip.qpos, done.clip.qpos, atol=1e-3)
@@ -195,6 +196,25 @@ def test_swinging_foot_clears_the_floor(robot):
     np.testing.assert_allclose(height[stands], 0, atol=1e-12)
     np.testing.assert_allclose(height[4:-4], retarget.CLEARANCE, atol=1e-12)
     np.testing.assert_allclose(height[2], retarget.CLEARANCE / 3, atol=1e-12)
+
+
+def test_any_motion_is_solved_or_refused(robot, source):
+    """Joints that turn at random, feet that never stand, a toe under its ankle: limits hold and nothing is infinite."""
+    pytest.importorskip("mink")
+    random = np.random.default_rng(0)
+    values = source.values[:8].copy()
+    toe = 6 * source.names.index("LeftToe")
+    values[:, toe : toe + 3] = [0.0, -5.0, 0.0]
+    wild = values + random.uniform(-180, 180, values.shape)
+    wild[:, toe : toe + 3] = [0.0, -5.0, 0.0]
+    for changed in (values, wild):
+        found = retarget.retarget(source._replace(values=changed), robot, "walk")
+        assert np.isfinite(found.clip.qvel).all()
+        assert (found.clip.qpos[:, 7:] >= robot.joint_low).all()
+        assert (found.clip.qpos[:, 7:] <= robot.joint_high).all()
+    values[3, 0] = 1e9
+    with pytest.raises(UserError, match="walk: the motion is 1e.07 m away at the robot's size, expected less than"):
+        retarget.retarget(source._replace(values=values), robot, "walk")
 
 
 # --- faults and the command ------------------------------------------------------------------------------------------

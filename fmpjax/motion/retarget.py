@@ -40,6 +40,8 @@ JOINT_NAMES = {
 }
 MOST_RATE = 60.0  # Hz; of a faster source every second, third, ... frame is used
 
+MOST_REACH = 1e5  # m
+
 # Of a heel or toe that stands, at the robot's size.
 CONTACT_HEIGHT = 0.03  # m, above where it usually stands
 CONTACT_SPEED = 0.3  # m/s
@@ -59,7 +61,7 @@ WEIGHTS = {
 }
 POSTURE_WEIGHT = 0.01  # 1/rad, toward the default pose: decides what the targets leave open
 DAMPING = 1e-4
-FIRST_ITERATIONS, ITERATIONS = 100, 3
+FIRST_ITERATIONS, ITERATIONS = 100, 2
 SMALL_STEP = 1e-3  # rad and m; a frame that moves less is solved
 
 
@@ -89,8 +91,8 @@ def retarget(source: Bvh, robot: Robot, name: str) -> Retargeted:
       name: of the clip, and of the source in errors.
 
     Raises:
-      UserError: the skeleton lacks a joint or has legs of no length, the clip is too short, the robot has no landmarks,
-        or mink is not installed.
+      UserError: the skeleton lacks a joint or a limb has no length, the motion is too short or goes too far, the robot
+        has no landmarks, or mink is not installed.
     """
     if not robot.landmarks:
         raise UserError(f"robot {robot.name!r} has no landmarks in its robot.toml, which retargeting needs")
@@ -109,6 +111,11 @@ def retarget(source: Bvh, robot: Robot, name: str) -> Retargeted:
             raise UserError(f"{name}: the skeleton's {a} and {b} are at one place, expected a distance")
     rest = _rest(robot)
     scale = _leg_length(rest) / _leg_length(position)
+    reach = scale * max(float(np.abs(p).max()) for p in position.values())
+    if not reach < MOST_REACH:
+        raise UserError(
+            f"{name}: the motion is {reach:.3g} m away at the robot's size, expected less than {MOST_REACH:g}"
+        )
     targets = _targets(robot, rest, {part: scale * p for part, p in position.items()}, rotation_wxyz, rate)
     qpos, residual = _solve(robot, targets, rate)
     return Retargeted(MotionClip.from_qpos(name, robot.name, rate, qpos), residual, targets.contact, scale)
@@ -237,8 +244,8 @@ def _quaternion_wxyz(axes: np.ndarray) -> np.ndarray:
 def _along(start: np.ndarray, position: dict, rest: dict, near: str, far: str) -> np.ndarray:
     """The end ``[T, 3]`` of the robot's segment from ``near`` to ``far`` that points as the human's does."""
     segment = position[far] - position[near]
-    length = np.linalg.norm(segment, axis=-1, keepdims=True)
-    return start + np.linalg.norm(rest[far] - rest[near]) * segment / np.maximum(length, 1e-9)
+    length = np.linalg.norm(rest[far] - rest[near])
+    return start + length * segment / np.linalg.norm(segment, axis=-1, keepdims=True)
 
 
 def _contacts(position: dict, rate: float) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
@@ -257,13 +264,13 @@ def _contacts(position: dict, rate: float) -> tuple[np.ndarray, np.ndarray, dict
 def _foot(rotation_wxyz: np.ndarray, toe: np.ndarray, flat: np.ndarray, rate: float) -> np.ndarray:
     """Orientation ``[T, 4]`` of a foot, level where it stands on heel and toe (``flat [T]``)."""
     inverse = rotations.conjugate(rotation_wxyz)
-    # What is up in the foot is known while it stands; one that never stands is taken as level when its toe is lowest.
-    standing = flat if flat.any() else toe[:, 2] == toe[:, 2].min()
+    # What is up in the foot is known while it stands; one that never stands is taken as level on average.
+    standing = flat if flat.any() else ~flat
     up = rotations.rotate(inverse, np.array([0.0, 0.0, 1.0]))[standing].mean(axis=0)
     up = up / np.linalg.norm(up)
     ahead = rotations.rotate(inverse, toe).mean(axis=0)
     ahead = ahead - (ahead @ up) * up
-    ahead = ahead / np.linalg.norm(ahead)
+    ahead = ahead / max(np.linalg.norm(ahead), 1e-9)  # a toe right under the ankle points nowhere
     foot_wxyz = rotations.multiply(rotation_wxyz, _quaternion_wxyz(np.column_stack([ahead, np.cross(up, ahead), up])))
     heading = np.zeros_like(toe)
     heading[:, 2] = rotations.yaw(foot_wxyz)
@@ -332,7 +339,7 @@ def _solve(robot: Robot, targets: Targets, rate: float) -> tuple[np.ndarray, np.
         part: mink.FrameTask(robot.landmarks[part] + 1, "body", *WEIGHTS[part.rpartition("_")[2]])
         for part in targets.position
     }
-    limits = [mink.ConfigurationLimit(model)]
+    tasks, limits = [*frame.values(), posture], [mink.ConfigurationLimit(model)]
     measured = [part for part in frame if WEIGHTS[part.rpartition("_")[2]][0] > 0]
     bodies = np.array([robot.landmarks[part] + 1 for part in measured])
     wanted = np.stack([targets.position[part] for part in measured], axis=1)
@@ -345,9 +352,7 @@ def _solve(robot: Robot, targets: Targets, rate: float) -> tuple[np.ndarray, np.
                 turned = targets.rotation_wxyz.get(part)
                 wxyz = data.xquat[robot.landmarks[part] + 1] if turned is None else turned[t]
                 task.set_target(mink.SE3(np.concatenate([wxyz, targets.position[part][t]])))
-            step = mink.solve_ik(
-                configuration, [*frame.values(), posture], 1.0, solver="daqp", damping=DAMPING, limits=limits
-            )
+            step = mink.solve_ik(configuration, tasks, 1.0, solver="daqp", damping=DAMPING, limits=limits)
             configuration.integrate_inplace(step, 1.0)
             if np.abs(step).max() < SMALL_STEP:
                 break
