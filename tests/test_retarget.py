@@ -231,7 +231,7 @@ def test_faults(robot, source, monkeypatch):
         at = 6 * source.names.index("LeftLeg")
         values[:, at : at + 3] = 0.0
         retarget.retarget(source._replace(values=values), robot, "walk")
-    with pytest.raises(UserError, match="robot 'unitree_g1' has no landmarks in its robot.toml"):
+    with pytest.raises(UserError, match="robot 'unitree_g1' has no landmark 'pelvis' in its robot.toml"):
         retarget.retarget(source, dataclasses.replace(robot, landmarks={}), "walk")
     monkeypatch.setitem(sys.modules, "mink", None)
     with pytest.raises(UserError, match=r"needs the package mink: install fmpjax\[retarget\]"):

@@ -92,10 +92,14 @@ def retarget(source: Bvh, robot: Robot, name: str) -> Retargeted:
 
     Raises:
       UserError: the skeleton lacks a joint or a limb has no length, the motion is too short or goes too far, the robot
-        has no landmarks, or mink is not installed.
+        lacks a landmark, or mink is not installed.
     """
-    if not robot.landmarks:
-        raise UserError(f"robot {robot.name!r} has no landmarks in its robot.toml, which retargeting needs")
+    needed = ["pelvis", "chest", *(f"{side}_{part}" for side in SIDES for part in JOINT_NAMES if part != "toe")]
+    missing = [part for part in needed if part not in robot.landmarks]
+    if missing:
+        raise UserError(
+            f"robot {robot.name!r} has no landmark {missing[0]!r} in its robot.toml, which retargeting needs"
+        )
     every = max(1, math.ceil(source.rate / MOST_RATE - 1e-6))
     rate = source.rate / every
     values = source.values[::every]
