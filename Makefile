@@ -74,6 +74,6 @@ $(READY): pyproject.toml constraints.txt
 	    "$$found" -m venv $(VENV); \
 	  fi; \
 	fi
-	@if [ -n '$(UV)' ]; then uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '.[dev,viz]'; \
-	else $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,viz]'; fi
+	@if [ -n '$(UV)' ]; then uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '.[dev,viz,retarget]'; \
+	else $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,viz,retarget]'; fi
 	@touch $@

@@ -52,6 +52,7 @@ class Robot:
     sole_radius: np.ndarray  # [P] m
     sagittal_joints: np.ndarray  # [6] indices: left hip, knee, ankle, then right
     total_mass: float  # kg
+    landmarks: dict[str, int]  # index of the body that stands for a human's pelvis, chest, left_hip and so on
 
     @property
     def joint_count(self) -> int:
@@ -131,6 +132,7 @@ def _read(name: str, path: Path) -> Robot:
         sole_radius=np.array([g.size[0] for g in soles]),
         sagittal_joints=np.array([index[j] for j in facts["sagittal_joints"]]),
         total_mass=float(model.body_mass.sum()),
+        landmarks={part: model.body(body).id - 1 for part, body in facts.get("landmarks", {}).items()},
     )
     robot.default_qpos[2] -= lowest_sole(robot, robot.default_qpos)
     return robot

@@ -1,10 +1,10 @@
-"""The bundled walk: the figures that make it a walk, and that the package can write it again."""
+"""The bundled motions: the figures that make them walks, and that the package can write them again."""
 
 import mujoco
 import numpy as np
 import pytest
 
-from fmpjax import motion
+from fmpjax import motion, rotations
 from fmpjax.errors import UserError
 from fmpjax.motion import gait
 
@@ -136,6 +136,129 @@ def _clip(walk, qpos):
     return motion.MotionClip.from_qpos(walk.name, walk.robot, walk.rate, qpos)
 
 
+# --- the library -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["turn_left", *(pytest.param(name, marks=pytest.mark.slow) for name in ("slow_walk", "fast_walk", "turn_right"))],
+)
+def test_library_is_what_the_package_writes(robot, name):
+    again, bundled = gait.synthesize(robot, **gait.LIBRARY[name]), motion.load(name)
+    np.testing.assert_allclose(again.qpos, bundled.qpos, atol=1e-4)
+
+
+def test_library_is_what_is_bundled():
+    assert motion.bundled() == sorted(gait.LIBRARY)
+
+
+@pytest.mark.parametrize(
+    ("name", "speed", "turn", "cadence"),
+    [
+        ("slow_walk", 0.5, 0.0, 1.39),
+        ("walk", 0.85, 0.0, 1.85),
+        ("fast_walk", 1.1, 0.0, 2.08),
+        # The root is on the inner side of the path, on which the feet are.
+        ("turn_left", 0.68, 0.5, 1.85),
+        ("turn_right", 0.68, -0.5, 1.85),
+    ],
+)
+def test_figures_of_the_library(robot, name, speed, turn, cadence):
+    figures = gait.measure(robot, motion.load(name))
+    assert figures["speed"] == pytest.approx(speed, abs=0.003)
+    assert figures["turn"] == pytest.approx(turn, abs=1e-6)
+    assert figures["cadence"] == pytest.approx(cadence, abs=0.02)
+    for figure, low, high in (
+        ("height_min", 0.71, 0.76),
+        ("height_max", 0.75, 0.79),
+        ("slip", 0, 0.005),
+        ("penetration", 0, 0.001),
+        ("gap", 0, 0.001),
+        ("clearance", 0.02, 0.04),
+        ("limit_margin", 0.1, np.inf),
+        ("joint_speed", 3, 9),
+        ("joint_acceleration", 0, 180),
+        ("double_support", 0.15, 0.3),
+        ("lateral", 0.02, 0.045),
+        ("balance", 0, 0.015),
+    ):
+        assert low <= figures[figure] <= high, f"{figure} is {figures[figure]:.4g}"
+
+
+def test_library_touches_nothing_but_the_floor(robot):
+    data = mujoco.MjData(robot.model)
+    feet = {0, *(robot.sole_body + 1).tolist()}
+    for name in gait.LIBRARY:
+        for row in motion.load(name).qpos[:70:3]:
+            data.qpos[:] = row
+            mujoco.mj_forward(robot.model, data)
+            assert {int(robot.model.geom_bodyid[g]) for c in data.contact for g in c.geom} <= feet
+
+
+# --- turning ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def turning():
+    return motion.load("turn_left")
+
+
+@pytest.fixture(scope="module")
+def centre(turning):
+    """Centre of the path: the point about which a stride turns."""
+    start, end = turning.qpos[0, :2], turning.qpos[STRIDE, :2]
+    angle = 0.5 * STRIDE / 50
+    c, s = np.cos(angle), np.sin(angle)
+    rotation = np.array([[c, -s], [s, c]])
+    return np.linalg.solve(np.eye(2) - rotation, end - rotation @ start)
+
+
+def test_every_turning_stride_is_the_first_one_turned(turning, centre):
+    turn_wxyz = rotations.exp_map(np.array([0.0, 0.0, 0.5 * STRIDE / 50]))
+    first, later = turning.qpos[:STRIDE], turning.qpos[STRIDE : 2 * STRIDE]
+    middle = np.append(centre, 0.0)
+    np.testing.assert_allclose(later[:, :3], middle + rotations.rotate(turn_wxyz, first[:, :3] - middle), atol=1e-9)
+    np.testing.assert_allclose(np.abs(np.sum(later[:, 3:7] * rotations.multiply(turn_wxyz, first[:, 3:7]), axis=1)), 1)
+    np.testing.assert_allclose(later[:, 7:], first[:, 7:], atol=1e-9)
+
+
+def test_feet_stand_on_arcs_beside_the_path(robot, turning, centre):
+    """Path of 0.7 m/s at 0.5 rad/s to the left: 1.4 m around; each foot stands half the width inside or outside."""
+    data = mujoco.MjData(robot.model)
+    left, right = dict.fromkeys((robot.sole_body + 1).tolist())
+    for at, foot, radius in ((STRIDE // 4, left, 1.4 - 0.085), (STRIDE * 3 // 4, right, 1.4 + 0.085)):
+        data.qpos[:] = turning.qpos[at]
+        mujoco.mj_kinematics(robot.model, data)
+        assert np.linalg.norm(data.xpos[foot, :2] - centre) == pytest.approx(radius, abs=1e-4)
+
+
+def test_right_turn_mirrors_the_left_one(robot, turning):
+    other = motion.load("turn_right")
+    left, right = slice(0, 3), slice(3, 6)
+    joints = turning.qpos[:, 7 + robot.sagittal_joints], other.qpos[:, 7 + robot.sagittal_joints]
+    half = STRIDE // 2
+    np.testing.assert_allclose(joints[1][half:STRIDE, right], joints[0][:half, left], atol=5e-3)
+    np.testing.assert_allclose(joints[1][half:STRIDE, left], joints[0][:half, right], atol=5e-3)
+
+
+def test_ground_pushes_toward_the_centre(robot, turning, centre):
+    """Over a stride the push, seen from the walker, is the weight and what holds the mass on its circle."""
+    period = STRIDE / 50
+    _, force = gait._ground_force(robot, turning.qpos[:STRIDE], 50.0, 0.7 * period, 0.5 * period)
+    data, inward = mujoco.MjData(robot.model), np.zeros((STRIDE, 3))
+    for i, row in enumerate(turning.qpos[:STRIDE]):
+        data.qpos[:] = row
+        mujoco.mj_forward(robot.model, data)
+        inward[i, :2] = centre - data.subtree_com[1, :2]
+    expected = robot.total_mass * 0.5**2 * np.mean(np.linalg.norm(inward, axis=1))
+    inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+    assert np.mean(np.sum(force * inward, axis=1)) == pytest.approx(expected, rel=0.05)
+    assert force[:, 2].mean() / (robot.total_mass * gait.GRAVITY) == pytest.approx(1, abs=2e-3)
+
+
+# --- arguments -------------------------------------------------------------------------------------------------------
+
+
 def test_other_speeds_and_rates(robot):
     slow = gait.measure(robot, gait.synthesize(robot, speed=0.7, duration=3.0))
     assert slow["speed"] == pytest.approx(0.7)
@@ -154,9 +277,42 @@ def test_faults(robot):
         gait.synthesize(robot, duration=0.5)
     with pytest.raises(UserError, match="out of the legs' reach"):
         gait.synthesize(robot, speed=2.0, duration=2.0)
+    with pytest.raises(UserError, match="out of the legs' reach"):
+        gait.synthesize(robot, turn=2.0)
+    with pytest.raises(UserError, match="turn is inf, expected a finite number"):
+        gait.synthesize(robot, turn=float("inf"))
+    with pytest.raises(UserError, match="duration is 1000000000.0 s, expected at most 200000 s at 50 Hz"):
+        gait.synthesize(robot, duration=1e9)
+    with pytest.raises(UserError, match="cadence is 0, expected a positive number of steps/s"):
+        gait.synthesize(robot, style=gait.Style(cadence=0))
+    with pytest.raises(UserError, match="elbow is nan, expected a finite number"):
+        gait.synthesize(robot, style=gait.Style(elbow=float("nan")))
+    with pytest.raises(UserError, match="the style's phases are flat 0.087, heel_off 0.6.*: expected growing numbers"):
+        gait.synthesize(robot, style=gait.Style(heel_off=0.6))
 
 
 def test_command_writes_the_file(robot, tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["gait", "--out", str(tmp_path / "walk.npz"), "--duration", "1.1"])
     gait.main()
     assert len(motion.load(tmp_path / "walk.npz")) == STRIDE + 1
+
+
+def test_command_has_the_turn_and_the_style(robot, tmp_path, monkeypatch):
+    out = tmp_path / "turn.npz"
+    options = "--speed 0.6 --turn -0.3 --duration 3.3 --step-height 0.05 --style.pelvis-height 0.75"
+    monkeypatch.setattr("sys.argv", ["gait", "--out", str(out), *options.split()])
+    gait.main()
+    figures = gait.measure(robot, motion.load(out))
+    assert figures["turn"] == pytest.approx(-0.3)
+    assert figures["clearance"] > 0.033
+    assert figures["height_min"] < 0.74
+
+
+def test_command_says_what_is_wrong(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "turn.npz"
+    monkeypatch.setattr("sys.argv", ["gait", "--out", str(out), "--speed", "-1"])
+    with pytest.raises(SystemExit) as caught:
+        gait.main()
+    assert caught.value.code == 2
+    assert capsys.readouterr().err == "speed is -1.0, expected a positive number of m/s\n"
+    assert not out.exists()

@@ -1,26 +1,34 @@
-"""A walk of our own for the Unitree G1: prescribed feet, pelvis and arms, inverse kinematics, balance by iteration.
+"""Walks of our own for the Unitree G1: prescribed feet, pelvis and arms, inverse kinematics, balance by iteration.
 
 The feet are given. A foot lands on the edge of its heel, rolls flat, stands, rolls over the edge of its toe and swings;
 edges roll without sliding. The legs follow by inverse kinematics. The path of the pelvis over the floor is then found
 so that the zero-moment point - where the ground must push for the motion to be possible - goes from foot to foot and
 from heel to toe. A pendulum relates the two well enough to correct one by the error of the other, harmonic by harmonic.
 
-Phases are fractions of a stride and start at the left heel's landing; the right leg is the left one's mirror image half
-a stride later. Run ``python -m fmpjax.motion.gait --out motions/walk.npz`` to write the bundled file.
+A walk that turns goes along an arc. Each foot stands as on a straight line, only the line's direction is the arc's
+where the foot lands. Seen from a frame that moves along the arc and turns with it, every stride is the same: there the
+balance is found in the same way.
+
+Phases are fractions of a stride and start at the left heel's landing; of a straight walk, the right leg is the left
+one's mirror image half a stride later. Run ``python -m fmpjax.motion.gait --out motions/walk.npz`` to write the bundled
+walk; `LIBRARY` has the arguments of the other bundled motions.
 """
 
-import argparse
 import dataclasses
 import math
+import sys
+from pathlib import Path
+from typing import Annotated
 
 import mujoco
 import numpy as np
+import tyro
 from scipy.interpolate import BPoly
 
 from fmpjax import robots, rotations
 from fmpjax.errors import UserError
 from fmpjax.motion.clip import MotionClip
-from fmpjax.motion.formats import save
+from fmpjax.motion.formats import MOST_SAMPLES, save
 from fmpjax.robots import Robot
 
 GRAVITY = 9.81  # m/s^2
@@ -42,7 +50,8 @@ class Style:
     toe_off: float = 0.562
     highest_at: float = 0.604
     lowest_at: float = 0.962
-    swing_lift: float = 0.0355  # added to the swing foot's height at its middle
+    # Added to the swing foot's height at its middle.
+    swing_lift: Annotated[float, tyro.conf.arg(aliases=["--step-height"])] = 0.0355
     pelvis_height: float = 0.764  # mean
     pelvis_bob: float = 0.0165  # half of the vertical travel, highest in mid-stance
     pelvis_yaw: float = 0.07
@@ -61,44 +70,137 @@ class Style:
     pressure_inward: float = 0.01  # toward the other foot
 
 
+# The bundled motions, as keywords of `synthesize`.
+LIBRARY = {
+    "walk": {},
+    "slow_walk": {
+        "speed": 0.5,
+        "style": Style(
+            cadence=1.4,
+            landing_pitch=-0.2,
+            lowest_pitch=-0.25,
+            highest_pitch=0.6,
+            heel_off=0.42,
+            toe_off=0.59,
+            highest_at=0.63,
+            swing_lift=0.03,
+            pelvis_yaw=0.05,
+            arm_swing=0.2,
+            elbow_swing=0.1,
+        ),
+    },
+    "fast_walk": {
+        "speed": 1.1,
+        "style": Style(
+            cadence=2.1,
+            landing_pitch=-0.32,
+            lowest_pitch=-0.39,
+            heel_off=0.38,
+            highest_at=0.62,
+            pelvis_height=0.735,
+            pelvis_bob=0.02,
+            pelvis_yaw=0.1,
+            arm_swing=0.42,
+        ),
+    },
+    "turn_left": {"speed": 0.7, "turn": 0.5, "style": Style(pelvis_height=0.755)},
+    "turn_right": {"speed": 0.7, "turn": -0.5, "style": Style(pelvis_height=0.755)},
+}
+
+
 def synthesize(
-    robot: Robot, *, speed: float = 0.85, duration: float = 8.0, rate: float = 50.0, style: Style = Style()
+    robot: Robot,
+    *,
+    speed: float = 0.85,
+    turn: float = 0.0,
+    duration: float = 8.0,
+    rate: float = 50.0,
+    style: Style = Style(),
 ) -> MotionClip:
-    """A steady walk along +x from the origin.
+    """A steady walk from the origin, along +x at first.
 
     Args:
       robot: a robot with the G1's joints.
-      speed: m/s.
+      speed: along the path, m/s.
+      turn: of the path's direction, positive to the left, rad/s.
       duration: upper bound, s; the clip holds as many whole strides as fit, and the sample that closes the last.
       rate: samples per second, Hz.
       style: how the walk looks.
 
     Raises:
-      UserError: a number is not positive, a joint is missing, no stride fits, or a foot is out of the leg's reach.
+      UserError: a number is not positive or the style's phases are out of order, a joint is missing, no stride fits, or
+        a foot is out of the leg's reach.
     """
-    for name, value, unit in (("speed", speed, "m/s"), ("rate", rate, "Hz"), ("duration", duration, "s")):
+    for name, value, unit in (
+        ("speed", speed, "m/s"),
+        ("rate", rate, "Hz"),
+        ("duration", duration, "s"),
+        ("cadence", style.cadence, "steps/s"),
+    ):
         if not (math.isfinite(value) and value > 0):
             raise UserError(f"{name} is {value}, expected a positive number of {unit}")
+    for name, value in (("turn", turn), *dataclasses.asdict(style).items()):
+        if not math.isfinite(value):
+            raise UserError(f"{name} is {value}, expected a finite number")
+    if not (0 < style.flat < style.heel_off < 0.5 < style.toe_off < style.highest_at < style.lowest_at < 1):
+        raise UserError(
+            f"the style's phases are flat {style.flat}, heel_off {style.heel_off}, toe_off {style.toe_off}, "
+            f"highest_at {style.highest_at}, lowest_at {style.lowest_at}: expected growing numbers between 0 and 1, "
+            "of which the first two are below 0.5"
+        )
+    if duration * rate > MOST_SAMPLES:
+        raise UserError(f"duration is {duration} s, expected at most {MOST_SAMPLES / rate:g} s at {rate:g} Hz")
     samples = 2 * max(1, round(rate / style.cadence))
     strides = int(duration * rate / samples + 1e-9)
     if strides < 1:
         raise UserError(f"duration is {duration} s, expected at least one stride of {samples / rate:.2f} s")
-    stride = _Stride(robot, speed, samples / rate, style)
-    cycle = stride.solve(samples)
-    qpos = np.concatenate([np.tile(cycle, (strides, 1)), cycle[:1]])
-    count = np.repeat(np.arange(strides + 1), samples)[: len(qpos)]
-    qpos[:, 0] += count * speed * samples / rate - cycle[0, 0]
+    period = samples / rate
+    cycle = _Stride(robot, speed * period, turn * period, period, style).solve(samples)
+    rows = [_moved(cycle, i * speed * period, i * turn * period) for i in range(strides + 1)]
+    qpos = np.concatenate([*rows[:-1], rows[-1][:1]])
+    qpos[:, 0] -= cycle[0, 0]
     return MotionClip.from_qpos("walk", robot.name, rate, qpos)
 
 
+def _arc(length: float, angle: float) -> np.ndarray:
+    """End ``[..., 2]`` of an arc from the origin along +x: ``length [...]`` m that turn by ``angle [...]`` rad."""
+    chord = length * np.sinc(angle / (2 * np.pi))
+    return np.stack([chord * np.cos(angle / 2), chord * np.sin(angle / 2)], axis=-1)
+
+
+def _turned(points: np.ndarray, angle: float) -> np.ndarray:
+    """Points ``[..., 2]`` turned about the origin by ``angle [...]`` (rad)."""
+    c, s = np.cos(angle), np.sin(angle)
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+
+def _heading_wxyz(angle: float) -> np.ndarray:
+    """Quaternion ``[..., 4]`` of a turn about z by ``angle [...]`` (rad)."""
+    half = np.asarray(angle) / 2
+    zero = np.zeros_like(half)
+    return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+
+
+def _moved(qpos: np.ndarray, advance: float, angle: float) -> np.ndarray:
+    """Configurations ``[..., 7 + J]`` moved along the arc of length ``advance`` (m) that turns by ``angle`` (rad)."""
+    qpos = qpos.copy()
+    qpos[..., :2] = _arc(advance, angle) + _turned(qpos[..., :2], angle)
+    qpos[..., 3:7] = rotations.multiply(_heading_wxyz(angle), qpos[..., 3:7])
+    return qpos
+
+
 class _Stride:
-    """One stride as functions of the phase; the path of the pelvis over the floor is a Fourier series."""
+    """One stride as functions of the phase; the path of the pelvis over the floor is a Fourier series.
+
+    The walker's frame moves along the path, ``length`` m and ``angle`` rad a stride; at phase 0 it is the world's.
+    """
 
     harmonics = 7
     iterations = 8
 
-    def __init__(self, robot: Robot, speed: float, period: float, style: Style):
-        self.robot, self.style, self.period, self.length = robot, style, period, speed * period
+    def __init__(self, robot: Robot, length: float, angle: float, period: float, style: Style):
+        self.robot, self.style, self.period, self.length, self.angle = robot, style, period, length, angle
         self.data = mujoco.MjData(robot.model)
         feet = list(dict.fromkeys(robot.sole_body.tolist()))
         if len(feet) != 2:
@@ -119,48 +221,60 @@ class _Stride:
                 [s.landing_pitch, landing_rate, 0.0],
             ],
         )
-        off, on = self._standing(s.toe_off, 0.0), self._standing(1.0, self.length)
-        self.swing = BPoly.from_derivatives([s.toe_off, 1.0], [off, on])
+        # From where a foot stands to where it stands next, for either foot, in the frame of the former.
+        self.swing = []
+        for sign in (1, -1):
+            aside = np.array([0.0, sign * s.half_width])
+            next_place = _arc(length, angle) + _turned(aside, angle) - aside
+            off, on = self._standing(s.toe_off), self._standing(1.0)
+            for value in on:
+                value[:2] = _turned(value[:2], angle)
+            on[0][:2] += next_place
+            self.swing.append(BPoly.from_derivatives([s.toe_off, 1.0], [off, on]))
+        self.swing_heading = BPoly.from_derivatives([s.toe_off, 1.0], [[0.0, 0.0, 0.0], [angle, 0.0, 0.0]])
 
-    def _standing(self, phase: float, origin: float) -> list[np.ndarray]:
-        """Position ``[3]`` of a foot that stands with its centre ``origin`` ahead, and two derivatives by phase."""
+    def _standing(self, phase: float) -> list[np.ndarray]:
+        """Position ``[3]`` of a foot that stands with its centre at the origin, and two derivatives by phase."""
         h = 1e-4
-        a, b, c = (self._rolled(float(self.pitch((phase + d) % 1.0)), origin) for d in (-h, 0.0, h))
+        a, b, c = (self._rolled(float(self.pitch((phase + d) % 1.0))) for d in (-h, 0.0, h))
         return [b, (c - a) / (2 * h), (a - 2 * b + c) / h**2]
 
-    def _rolled(self, pitch: float, origin: float) -> np.ndarray:
-        """Position ``[3]`` of the foot's body, in the foot's heading, when the sole has rolled to ``pitch``.
+    def _rolled(self, pitch: float) -> np.ndarray:
+        """Position ``[3]`` of the foot's body, in the frame where it stands, when the sole has rolled to ``pitch``.
 
         The edge that touches has a radius, so its centre moves on by radius times angle.
         """
         edge = self.legs[0].heel if pitch < 0 else self.legs[0].toe
         radius = self.legs[0].radius
-        centre = np.array([origin + edge[0] + radius * pitch, 0.0, radius])
+        centre = np.array([edge[0] + radius * pitch, 0.0, radius])
         c, s = np.cos(pitch), np.sin(pitch)
         return centre - np.array([c * edge[0] + s * edge[2], 0.0, c * edge[2] - s * edge[0]])
 
-    def foot(self, phase: float) -> tuple[np.ndarray, float]:
-        """Position ``[3]`` of the foot that lands with its centre at x = 0 at phase 0, and its pitch; any phase."""
-        turns, phase = np.divmod(phase, 1.0)
-        pitch = float(self.pitch(phase))
-        if phase <= self.style.toe_off:
-            position = self._rolled(pitch, 0.0)
-        else:
-            position = self.swing(phase)
-            s = (phase - self.style.toe_off) / (1 - self.style.toe_off)
-            position = position + [0.0, 0.0, self.style.swing_lift * 16 * s**2 * (1 - s) ** 2]
-        return position + [turns * self.length, 0.0, 0.0], pitch
+    def place(self, phase: float) -> tuple[np.ndarray, float]:
+        """The walker's frame: its origin, world ``[..., 2]``, and its heading, rad; any phase ``[...]``."""
+        return _arc(phase * self.length, phase * self.angle), phase * self.angle
 
     def foot_pose(self, side: int, phase: float) -> tuple[np.ndarray, np.ndarray]:
-        """World position ``[3]`` and wxyz orientation of the left (0) or right (1) foot."""
-        sign = 1 - 2 * side
-        position, pitch = self.foot(phase - 0.5 * side)
-        position = position + [0.5 * side * self.length, sign * self.style.half_width, 0.0]
-        heading = rotations.exp_map(np.array([0.0, 0.0, sign * self.style.toe_out]))
-        return position, rotations.multiply(heading, rotations.exp_map(np.array([0.0, pitch, 0.0])))
+        """World position ``[3]`` and wxyz orientation of the left (0) or right (1) foot; any phase.
+
+        The left foot's centre lands beside the walker's frame of phase 0, the right one's of phase 1/2.
+        """
+        s, sign = self.style, 1 - 2 * side
+        strides, phase = np.divmod(phase - 0.5 * side, 1.0)
+        pitch, heading = float(self.pitch(phase)), 0.0
+        if phase <= s.toe_off:
+            position = self._rolled(pitch)
+        else:
+            share = (phase - s.toe_off) / (1 - s.toe_off)
+            position = self.swing[side](phase) + [0.0, 0.0, s.swing_lift * 16 * share**2 * (1 - share) ** 2]
+            heading = float(self.swing_heading(phase))
+        origin, direction = self.place(strides + 0.5 * side)
+        position[:2] = origin + _turned(position[:2] + [0.0, sign * s.half_width], direction)
+        turn_wxyz = _heading_wxyz(direction + heading + sign * s.toe_out)
+        return position, rotations.multiply(turn_wxyz, rotations.exp_map(np.array([0.0, pitch, 0.0])))
 
     def upper(self, phase: float) -> np.ndarray:
-        """``qpos [7 + J]`` with everything but the legs and the pelvis' place over the floor."""
+        """``qpos [7 + J]`` in the walker's frame with everything but the legs and the pelvis' place over the floor."""
         s, j = self.style, self.joint
         qpos = np.zeros(self.robot.model.nq)
         forward = np.cos(2 * np.pi * phase)  # 1 when the left foot lands, -1 when the right does
@@ -186,40 +300,41 @@ class _Stride:
     def pressure(self, phase: float) -> np.ndarray:
         """Where the ground shall push, world ``[2]``: along the standing foot, across in double support."""
         s = self.style
-        turns, within = np.divmod(phase, 0.5)
-        side = int(turns) % 2
+        steps, within = np.divmod(phase, 0.5)
         double = s.toe_off - 0.5
-        sign = 1 - 2 * side
-        across = sign * (s.half_width - s.pressure_inward)
         if within >= double:
             share = (within - double) / (0.5 - double)
-            along = s.pressure_start + share * (s.pressure_end - s.pressure_start)
-        else:
-            share = within / double
-            share = share * share * (3 - 2 * share)
-            last = s.pressure_end - 0.5 * self.length
-            along = last + share * (s.pressure_start - last)
-            across *= 2 * share - 1
-        return np.array([0.5 * turns * self.length + along, across])
+            return self._under(steps, s.pressure_start + share * (s.pressure_end - s.pressure_start))
+        share = within / double
+        share = share * share * (3 - 2 * share)
+        last, present = self._under(steps - 1, s.pressure_end), self._under(steps, s.pressure_start)
+        return last + share * (present - last)
+
+    def _under(self, step: float, along: float) -> np.ndarray:
+        """World point ``[2]`` under the foot of the given step (even steps are the left foot's), ``along`` it (m)."""
+        across = (1 - 2 * (int(step) % 2)) * (self.style.half_width - self.style.pressure_inward)
+        origin, direction = self.place(0.5 * step)
+        return origin + _turned(np.array([along, across]), direction)
 
     def solve(self, samples: int) -> np.ndarray:
-        """Configurations ``[N, 7 + J]`` over one stride; the next one is the same, a stride's length ahead."""
+        """Configurations ``[N, 7 + J]`` over one stride; the next one is the same, a stride further along the path."""
         phase = np.arange(samples) / samples
-        advance = np.outer(phase * self.length, [1.0, 0.0])
-        wanted = np.array([self.pressure(p) for p in phase]) - advance
+        origin, heading = self.place(phase)
+        wanted = _turned(np.array([self.pressure(p) for p in phase]) - origin, -heading)
         qpos = np.array([self.upper(p) for p in phase])
+        qpos[:, 3:7] = rotations.multiply(_heading_wxyz(heading), qpos[:, 3:7])
         omega2 = GRAVITY / (0.87 * self.style.pelvis_height)  # the centre of mass is lower than the pelvis' top
         frequency = np.fft.rfftfreq(samples, 1 / samples)
         gain = 1 / (1 + (2 * np.pi * frequency / self.period) ** 2 / omega2)
         gain[frequency > self.harmonics] = 0.0
         path = np.fft.irfft(np.fft.rfft(wanted, axis=0) * gain[:, None], samples, axis=0)
         for _ in range(self.iterations):
-            qpos[:, :2] = path + advance
+            qpos[:, :2] = origin + _turned(path, heading)
             self._solve_legs(qpos, phase)
-            found = zero_moment_point(self.robot, qpos, samples / self.period, self.length) - advance
-            error = np.fft.rfft(wanted - found, axis=0) * gain[:, None]
+            found = zero_moment_point(self.robot, qpos, samples / self.period, self.length, self.angle)
+            error = np.fft.rfft(wanted - _turned(found - origin, -heading), axis=0) * gain[:, None]
             path = path + np.fft.irfft(error, samples, axis=0)
-        qpos[:, :2] = path + advance
+        qpos[:, :2] = origin + _turned(path, heading)
         self._solve_legs(qpos, phase)
         return qpos
 
@@ -274,17 +389,22 @@ class _Leg:
         qpos[7 + self.joints] = angles
 
 
-def zero_moment_point(robot: Robot, qpos: np.ndarray, rate: float, advance: float) -> np.ndarray:
-    """Where the ground pushes, ``[N, 2]`` m, through one period ``qpos [N, 7 + J]`` that moves on by ``advance`` m."""
-    return _ground_force(robot, qpos, rate, advance)[0]
+def zero_moment_point(robot: Robot, qpos: np.ndarray, rate: float, advance: float, angle: float = 0.0) -> np.ndarray:
+    """Where the ground pushes, ``[N, 2]`` m, through one period ``qpos [N, 7 + J]`` of a steady motion.
+
+    A period moves it on by ``advance`` m along the path and turns it by ``angle`` rad.
+    """
+    return _ground_force(robot, qpos, rate, advance, angle)[0]
 
 
-def _ground_force(robot: Robot, qpos: np.ndarray, rate: float, advance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Zero-moment point ``[N, 2]`` and total ground force ``[N, 3]`` (N) of a periodic motion."""
+def _ground_force(
+    robot: Robot, qpos: np.ndarray, rate: float, advance: float, angle: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Zero-moment point ``[N, 2]`` and total ground force ``[N, 3]`` (N) of a steady motion."""
     model, data = robot.model, mujoco.MjData(robot.model)
     before, after = np.roll(qpos, 1, axis=0), np.roll(qpos, -1, axis=0)
-    before[0, 0] -= advance
-    after[-1, 0] += advance
+    before[0] = _moved(before[0], -advance, -angle)
+    after[-1] = _moved(after[-1], advance, angle)
     point, force, out = np.zeros((len(qpos), 2)), np.zeros((len(qpos), 3)), np.zeros(model.nv)
     back, ahead = np.zeros(model.nv), np.zeros(model.nv)
     for i, (a, b, c) in enumerate(zip(before, qpos, after, strict=True)):
@@ -302,12 +422,13 @@ def _ground_force(robot: Robot, qpos: np.ndarray, rate: float, advance: float) -
 
 
 def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[str, float]:
-    """Quality figures of a straight walk.
+    """Quality figures of a steady walk that starts along +x.
 
     A sole point is in contact while its lowest point is less than ``contact`` (m) above the floor.
 
     Returns:
-      ``speed``: net, m/s. ``cadence``: steps/s. ``height_min``, ``height_max``: of the root, m.
+      ``speed``: mean along the path, m/s. ``turn``: mean, positive to the left, rad/s.
+      ``cadence``: steps/s. ``height_min``, ``height_max``: of the root, m.
       ``range_left_hip`` and so on: travel of the sagittal joints, deg.
       ``slip``: greatest way (m) that a touching point slides over the floor in one step; rolling is not sliding.
       ``penetration``: greatest depth of a sole point in the floor, m.
@@ -316,8 +437,9 @@ def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[s
       ``limit_margin``: least distance of a joint to its limit, rad.
       ``joint_speed`` (rad/s) and ``joint_acceleration`` (rad/s^2): greatest of any joint.
       ``double_support``: share of the time with both feet in contact.
-      ``lateral``: half of the root's sideways travel, m.
-      ``balance``: root mean square distance (m) of the zero-moment point from the box around the points on the floor.
+      ``lateral``: half of the root's sideways travel about its path, m.
+      ``balance``: root mean square distance (m) of the zero-moment point from the box, along and
+      across the path, around the points on the floor.
     """
     feet = list(dict.fromkeys(robot.sole_body.tolist()))
     points, rotation = _sole_points(robot, clip.qpos)
@@ -329,8 +451,14 @@ def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[s
     names = [f"range_{side}_{joint}" for side in ("left", "right") for joint in ("hip", "knee", "ankle")]
     landings = [np.flatnonzero(down[1:, i] & ~down[:-1, i]) + 1 for i in range(2)]
     strides = sum(len(at) - 1 for at in landings)
+    yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
+    turn = float(yaw[-1] - yaw[0]) / clip.duration
+    heading = turn * np.arange(len(clip)) / clip.rate
+    step = _turned(np.diff(clip.qpos[:, :2], axis=0), -(heading[1:] + heading[:-1]) / 2)
+    sideways = np.cumsum(step[:, 1] - step[:, 1].mean())
     return {
-        "speed": float((clip.qpos[-1, 0] - clip.qpos[0, 0]) / clip.duration),
+        "speed": float(step[:, 0].mean() * clip.rate),
+        "turn": turn,
         "cadence": 2 * strides * clip.rate / max(1, sum(at[-1] - at[0] for at in landings if len(at))),
         "height_min": float(clip.qpos[:, 2].min()),
         "height_max": float(clip.qpos[:, 2].max()),
@@ -344,8 +472,8 @@ def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[s
         # One-sided velocities at the ends would pass for jumps.
         "joint_acceleration": float(np.abs(np.diff(clip.qvel[1:-1, 6:], axis=0)).max() * clip.rate),
         "double_support": float(down.all(axis=1).mean()),
-        "lateral": float(np.ptp(clip.qpos[:, 1]) / 2),
-        "balance": _balance(robot, clip, points, height),
+        "lateral": float(np.ptp(sideways) / 2),
+        "balance": _balance(robot, clip, points, height, heading),
     }
 
 
@@ -388,26 +516,51 @@ def _clearance(height: np.ndarray, feet: list[np.ndarray], down: np.ndarray) -> 
     return least
 
 
-def _balance(robot: Robot, clip: MotionClip, points: np.ndarray, height: np.ndarray) -> float:
-    """Root mean square distance (m) of the zero-moment point from the box around the sole points near the floor."""
+def _balance(robot: Robot, clip: MotionClip, points: np.ndarray, height: np.ndarray, heading: np.ndarray) -> float:
+    """Root mean square distance (m) of the zero-moment point from the box around the sole points near the floor.
+
+    The box is along ``heading [T]`` (rad).
+    """
     inside = slice(2, len(clip.qpos) - 2)
-    push = _ground_force(robot, clip.qpos, clip.rate, 0.0)[0][inside]
+    push = _turned(_ground_force(robot, clip.qpos, clip.rate, 0.0)[0], -heading)[inside]
     near = height[inside, :, None] < 0.01
-    low = np.where(near, points[inside, :, :2], np.inf).min(axis=1)
-    high = np.where(near, points[inside, :, :2], -np.inf).max(axis=1)
+    spread = _turned(points[..., :2], -heading[:, None])[inside]
+    low = np.where(near, spread, np.inf).min(axis=1)
+    high = np.where(near, spread, -np.inf).max(axis=1)
     return float(np.sqrt(np.mean(np.sum((push - np.clip(push, low, high)) ** 2, axis=1))))
 
 
+def write(
+    out: Path,
+    robot: str = "unitree_g1",
+    speed: float = 0.85,
+    turn: float = 0.0,
+    duration: float = 8.0,
+    rate: float = 50.0,
+    style: Style = Style(),
+) -> None:
+    """Synthesise a walk and write it.
+
+    Args:
+      out: File to write, .npz.
+      robot: A robot under robots/.
+      speed: Along the path, m/s.
+      turn: To the left, rad/s.
+      duration: At most, s.
+      rate: Samples per second, Hz.
+      style: How the walk looks; lengths m, angles rad, phases as fractions of a stride.
+    """
+    machine = robots.load(robot)
+    save(synthesize(machine, speed=speed, turn=turn, duration=duration, rate=rate, style=style), out)
+
+
 def main() -> None:
-    """Write the bundled walk."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("--out", required=True, help="file to write, .npz")
-    parser.add_argument("--robot", default="unitree_g1")
-    parser.add_argument("--speed", type=float, default=0.85, help="m/s")
-    parser.add_argument("--duration", type=float, default=8.0, help="s")
-    arguments = parser.parse_args()
-    robot = robots.load(arguments.robot)
-    save(synthesize(robot, speed=arguments.speed, duration=arguments.duration), arguments.out)
+    """`write` as a command."""
+    try:
+        tyro.cli(write)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
 
 
 if __name__ == "__main__":
