@@ -6,7 +6,7 @@ import pytest
 
 from fmpjax import motion
 from fmpjax.errors import UserError
-from fmpjax.motion import gait
+from fmpjax.motion import gait, soles
 
 STRIDE = 54  # samples
 
@@ -76,7 +76,7 @@ def test_arms_swing_against_the_legs(robot, walk):
 
 
 def test_heel_lands_first_and_toe_leaves_last(robot, walk):
-    points, _ = gait._sole_points(robot, walk.qpos[:STRIDE])
+    points, _ = soles.sole_points(robot, walk.qpos[:STRIDE])
     left = robot.sole_body == robot.sole_body[0]
     height = (points[:, :, 2] - robot.sole_radius)[:, left]
     heel = robot.sole_point[left, 0] < 0

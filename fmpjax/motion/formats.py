@@ -15,7 +15,7 @@ from fmpjax import resources, robots
 from fmpjax.errors import UserError
 from fmpjax.motion import readers
 from fmpjax.motion.clip import MotionClip, resample, sample_count
-from fmpjax.motion.readers.recording import MOST_SAMPLES
+from fmpjax.motion.readers.recording import MOST_SAMPLES, Recording
 
 LEAST_SAMPLES = 11  # one window of the motion prior: ten past frames and the present one
 
@@ -45,18 +45,8 @@ def load(
     Raises:
       UserError: a file or an argument is bad.
     """
-    _check_rate("fps", fps)
     _check_rate("rate", rate)
-    span = _parse_frames(frames)
-    loaded = robots.load(robot)
-    file = locate(path)
-    qpos, source_rate = readers.read(file, loaded)
-    source_rate = source_rate if fps is None else float(fps)
-    if span is not None:
-        first, last = span
-        if last >= len(qpos):
-            raise UserError(f"{file}: frames {first}:{last} are outside the file, which has rows 0:{len(qpos) - 1}")
-        qpos = qpos[first : last + 1]
+    file, (qpos, source_rate) = record(path, fps=fps, frames=frames, robot=robot)
     count = sample_count(len(qpos), source_rate, rate)
     if min(count, len(qpos)) < LEAST_SAMPLES:
         raise UserError(
@@ -69,6 +59,27 @@ def load(
             f"expected at most {MOST_SAMPLES}"
         )
     return MotionClip.from_qpos(file.stem, robot, rate, resample(qpos, source_rate, rate))
+
+
+def record(
+    path: str | os.PathLike,
+    *,
+    fps: float | None = None,
+    frames: tuple[int, int] | str | None = None,
+    robot: str = "unitree_g1",
+) -> tuple[Path, Recording]:
+    """The file of a motion and its rows as they are, at their own rate; arguments and errors as of `load`."""
+    _check_rate("fps", fps)
+    span = _parse_frames(frames)
+    loaded = robots.load(robot)
+    file = _locate(path)
+    qpos, rate = readers.read(file, loaded)
+    if span is not None:
+        first, last = span
+        if last >= len(qpos):
+            raise UserError(f"{file}: frames {first}:{last} are outside the file, which has rows 0:{len(qpos) - 1}")
+        qpos = qpos[first : last + 1]
+    return file, Recording(qpos, rate if fps is None else float(fps))
 
 
 def save(clip: MotionClip, path: str | os.PathLike) -> Path:
@@ -97,7 +108,7 @@ def save(clip: MotionClip, path: str | os.PathLike) -> Path:
     return path
 
 
-def locate(path: str | os.PathLike) -> Path:
+def _locate(path: str | os.PathLike) -> Path:
     """The file that ``path`` names: a bundled motion's or its own."""
     file = Path(path)
     if file.name == str(path) and file.name in bundled():

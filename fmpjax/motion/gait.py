@@ -21,6 +21,7 @@ from fmpjax import robots, rotations
 from fmpjax.errors import UserError
 from fmpjax.motion.clip import MotionClip
 from fmpjax.motion.formats import save
+from fmpjax.motion.soles import slip, sole_points
 from fmpjax.robots import Robot
 
 GRAVITY = 9.81  # m/s^2
@@ -320,7 +321,7 @@ def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[s
       ``balance``: root mean square distance (m) of the zero-moment point from the box around the points on the floor.
     """
     feet = list(dict.fromkeys(robot.sole_body.tolist()))
-    points, rotation = _sole_points(robot, clip.qpos)
+    points, rotation = sole_points(robot, clip.qpos)
     height = points[:, :, 2] - robot.sole_radius
     touch = height < contact
     down = np.stack([touch[:, robot.sole_body == foot].any(axis=1) for foot in feet], axis=1)
@@ -335,7 +336,7 @@ def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[s
         "height_min": float(clip.qpos[:, 2].min()),
         "height_max": float(clip.qpos[:, 2].max()),
         **dict(zip(names, sagittal.tolist(), strict=True)),
-        "slip": _slip(robot, points, rotation, touch),
+        "slip": slip(robot, points, rotation, touch),
         "penetration": float(max(0.0, -height.min())),
         "gap": float(height.min(axis=1).max()),
         "clearance": _clearance(height, [robot.sole_body == foot for foot in feet], down),
@@ -347,33 +348,6 @@ def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[s
         "lateral": float(np.ptp(clip.qpos[:, 1]) / 2),
         "balance": _balance(robot, clip, points, height),
     }
-
-
-def _sole_points(robot: Robot, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World centres of the sole spheres ``[T, P, 3]`` and rotation matrices of their bodies ``[T, P, 3, 3]``."""
-    data = mujoco.MjData(robot.model)
-    points = np.zeros((len(qpos), len(robot.sole_body), 3))
-    rotation = np.zeros((*points.shape, 3))
-    for i, row in enumerate(qpos):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(robot.model, data)
-        rotation[i] = data.xmat[robot.sole_body + 1].reshape(-1, 3, 3)
-        points[i] = data.xpos[robot.sole_body + 1] + np.einsum("pij,pj->pi", rotation[i], robot.sole_point)
-    return points, rotation
-
-
-def _slip(robot: Robot, points: np.ndarray, rotation: np.ndarray, touch: np.ndarray) -> float:
-    """Greatest distance (m) that a point slides over the floor while it touches without a break."""
-    turn = rotation[1:] @ np.swapaxes(rotation[:-1], -1, -2)
-    # Rotation vector of a small turn; the bottom of the sphere moves by the turn crossed with minus the radius.
-    vector = 0.5 * np.stack([turn[..., 2, 1] - turn[..., 1, 2], turn[..., 0, 2] - turn[..., 2, 0]], axis=-1)
-    rolled = robot.sole_radius[:, None] * np.stack([-vector[..., 1], vector[..., 0]], axis=-1)
-    moved = np.linalg.norm(points[1:, :, :2] - points[:-1, :, :2] + rolled, axis=-1)
-    worst, run = 0.0, np.zeros(points.shape[1])
-    for distance, both in zip(moved, touch[1:] & touch[:-1], strict=True):
-        run = np.where(both, run + distance, 0.0)
-        worst = max(worst, float(run.max()))
-    return worst
 
 
 def _clearance(height: np.ndarray, feet: list[np.ndarray], down: np.ndarray) -> float:
