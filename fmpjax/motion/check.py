@@ -36,7 +36,7 @@ RANGES = {
     "root acceleration": Range("m/s²", 0.0, 40.0, 200.0),
     "root turn": Range("rad/s", 0.0, 10.0, 30.0),
     "flips": Range("", 0, 0),
-    "foot slip": Range("m/s", 0.0, 0.25, 1.0),
+    "foot slip": Range("m/s", 0.0, 0.3, 1.0),
     "penetration": Range("m", 0.0, 0.02, 0.08),
     "float": Range("m", 0.0, 0.02, 0.10),
     "torque": Range("of the limit", 0.0, 1.0, 4.0),

@@ -5,7 +5,6 @@ import sys
 import time
 from pathlib import Path
 
-import mujoco
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -51,7 +50,9 @@ def picture(robot: Robot, clip: MotionClip, path: str | Path) -> Path:
     if path.suffix == ".png":
         rows = np.unique(np.linspace(0, len(clip) - 1, PICTURES).round().astype(int))
         labels = [f"{row / clip.rate:.2f} s" for row in rows]
-        frames = render.render_frames(robot, clip.qpos[rows], width=240, height=240, labels=labels)
+        # Each picture has its robot in the middle: rows so far apart leave the camera's smooth path.
+        poses = clip.qpos[rows] * np.where(np.arange(clip.qpos.shape[1]) < 2, 0.0, 1.0)
+        frames = render.render_frames(robot, poses, width=240, height=240, labels=labels)
         return render.contact_sheet(path, frames, COLUMNS)
     if path.suffix not in (".mp4", ".gif"):
         raise UserError(f"cannot show a motion as {path}: expected a name that ends in .png, .mp4 or .gif")

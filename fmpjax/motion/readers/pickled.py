@@ -1,6 +1,6 @@
 """Arrays and plain containers from a pickle, without running what the pickle says.
 
-A pickle is a program: it names functions and calls them. This reader knows five names, those by which NumPy pickles
+A pickle is a program: it names functions and calls them. This reader knows six names, those by which NumPy pickles
 its arrays, and puts inert stand-ins behind them that check what they are given; any other name ends the reading. Keys
 of dictionaries must be text, because hashing a deep structure can exhaust the stack. The interpreter is Python's own
 of the pickle module: its C twin lets a few bytes reserve gigabytes.
@@ -76,8 +76,9 @@ class _Reader(pickle._Unpickler):
     del _code
 
     def find_class(self, module: str, name: str):
-        if module.partition(".")[0] == "numpy" and name in _KNOWN:
-            return _KNOWN[name]
+        known = _KNOWN.get((module.partition(".")[0], name))
+        if known is not None:
+            return known
         raise _Refused(f"the pickle names {module[:60]}.{name[:60]}")
 
     def _set(self, target: dict, items: list) -> None:
@@ -144,7 +145,7 @@ class _Array(_Inert):
 
     def _fill(self, raw, dtype, shape, order) -> None:
         if isinstance(raw, str):
-            raw = raw.encode("latin1")  # from Python 2, and from protocols below 3
+            raw = raw.encode("latin1")  # from Python 2
         shape = tuple(shape)
         if not isinstance(dtype, _Dtype) or math.prod(shape) * dtype.dtype.itemsize != len(raw):
             raise _Refused("the pickle has an array whose shape is not that of its content")
@@ -165,10 +166,20 @@ class _Scalar(_Array):
         self._fill(raw, dtype, (), "C")
 
 
+class _Encoded(_Inert):
+    """``_codecs.encode``, by which protocols below 3 write bytes."""
+
+    def __new__(cls, text, encoding):
+        if not isinstance(text, str) or encoding != "latin1":
+            raise _Refused("the pickle has bytes in an unknown encoding")
+        return text.encode("latin1")
+
+
 _KNOWN = {
-    "ndarray": _Class,
-    "dtype": _Dtype,
-    "_reconstruct": _Array,
-    "_frombuffer": _FromBuffer,
-    "scalar": _Scalar,
+    ("numpy", "ndarray"): _Class,
+    ("numpy", "dtype"): _Dtype,
+    ("numpy", "_reconstruct"): _Array,
+    ("numpy", "_frombuffer"): _FromBuffer,
+    ("numpy", "scalar"): _Scalar,
+    ("_codecs", "encode"): _Encoded,
 }

@@ -13,6 +13,7 @@ from fmpjax.robots import Robot
 MOST_SAMPLES = 10_000_000
 # Files carry six decimals; a norm further than this from one is not a rotation but another column.
 NORM_TOLERANCE = 0.05
+GREATEST = 1e6  # m or rad; more is another column, or damage
 
 
 class Recording(NamedTuple):
@@ -68,12 +69,13 @@ def order_by_name(file: Path, names: Sequence[str], robot: Robot) -> np.ndarray:
 
 
 def check_finite(file: Path, rows: np.ndarray, word: str, start: int) -> None:
-    """Refuse values of ``rows [T, n]`` that are not finite; ``start`` is the first row's and column's number."""
-    bad = np.argwhere(~np.isfinite(rows))
+    """Refuse values of ``rows [T, n]`` that are not finite or beyond `GREATEST`; ``start`` is the first number."""
+    bad = np.argwhere(~(np.abs(rows) < GREATEST))
     if len(bad):
         row, column = bad[0]
         raise UserError(
-            f"{file}: {word} {row + start}, column {column + start} is {rows[row, column]}, expected a finite number"
+            f"{file}: {word} {row + start}, column {column + start} is {rows[row, column]}, expected a finite number "
+            f"below {GREATEST:g}"
         )
 
 
