@@ -159,14 +159,11 @@ def test_not_a_number_is_broken():
 
 
 def test_torques_of_standing_carry_the_weight(robot):
-    """Virtual work: what the legs' motors give as the robot sinks is the weight times the way of its mass."""
+    """The knees' torques are those by which the model's own servos hold the same pose in the simulator."""
     clip = MotionClip.from_qpos("still", robot.name, 50.0, np.tile(robot.default_qpos, (15, 1)))
     points, _ = soles.sole_points(robot, clip.qpos)
     torque = check.torques(robot, clip, points, points[..., 2] - robot.sole_radius)[7]
     data = mujoco.MjData(robot.model)
-    data.qpos[:] = robot.default_qpos
-    # The model's own servos hold the pose; once it is at rest, their torques are the answer.
-    mujoco.mj_resetData(robot.model, data)
     data.qpos[:] = robot.default_qpos
     for _ in range(300):
         data.ctrl[:] = robot.default_qpos[7:]
