@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fmpjax import cli, motion, rotations
+from fmpjax import cli, motion, robots, rotations
 from fmpjax.errors import UserError
 from fmpjax.motion import MotionClip, check, edit, soles
 from fmpjax.viz import clip as show
@@ -158,21 +158,25 @@ def test_not_a_number_is_broken():
     assert check.Figure("speed", float("nan")).verdict == "broken"
 
 
-def test_torques_of_standing_carry_the_weight(robot):
-    """The knees' torques are those by which the model's own servos hold the same pose in the simulator."""
-    clip = MotionClip.from_qpos("still", robot.name, 50.0, np.tile(robot.default_qpos, (15, 1)))
+def test_torques_of_a_crouch_are_those_of_statics(robot):
+    """Moment about the knee of half the weight, under the mass centre, less that of shank and foot."""
+    crouch, index = robot.default_qpos.copy(), robot.joint_names.index
+    for side in ("left", "right"):
+        for joint, angle in (("hip_pitch", -0.7), ("knee", 1.2), ("ankle_pitch", -0.5)):
+            crouch[7 + index(f"{side}_{joint}_joint")] = angle
+    crouch[2] -= robots.lowest_sole(robot, crouch)
+    clip = MotionClip.from_qpos("still", robot.name, 50.0, np.tile(crouch, (15, 1)))
     points, _ = soles.sole_points(robot, clip.qpos)
     torque = check.torques(robot, clip, points, points[..., 2] - robot.sole_radius)[7]
     data = mujoco.MjData(robot.model)
-    data.qpos[:] = robot.default_qpos
-    for _ in range(300):
-        data.ctrl[:] = robot.default_qpos[7:]
-        data.qvel[:6] = 0
-        mujoco.mj_step(robot.model, data)
-    knees = [robot.joint_names.index(f"{side}_knee_joint") for side in ("left", "right")]
-    assert np.abs(data.qvel).max() < 0.2
-    np.testing.assert_allclose(torque[knees], np.abs(data.actuator_force[knees]), atol=4.0)
-    assert torque[knees].min() > 3
+    data.qpos[:] = crouch
+    mujoco.mj_forward(robot.model, data)
+    for side in ("left", "right"):
+        knee = robot.model.body(f"{side}_knee_link").id
+        foot = robot.model.body_subtreemass[knee] * (data.subtree_com[knee, 0] - data.xpos[knee, 0])
+        whole = robot.total_mass / 2 * (data.subtree_com[1, 0] - data.xpos[knee, 0])
+        assert torque[index(f"{side}_knee_joint")] == pytest.approx(9.81 * abs(whole - foot), rel=0.03)
+        assert torque[index(f"{side}_knee_joint")] > 15
 
 
 def test_three_thousand_frames_are_quick(robot, walk):

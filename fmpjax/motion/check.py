@@ -15,6 +15,7 @@ from fmpjax.robots import Robot
 
 CONTACT = 0.01  # m, a sole point below this height counts as standing
 BEARING = 0.03  # m, a sole point at this height bears nothing, one on the floor its share
+DAMPING = 1e-3  # keeps forces finite where few points are near the floor
 SMOOTHING = 0.07  # s, half of the window over which accelerations are fitted for the torques
 
 
@@ -39,7 +40,7 @@ RANGES = {
     "foot slip": Range("m/s", 0.0, 0.3, 1.0),
     "penetration": Range("m", 0.0, 0.02, 0.08),
     "float": Range("m", 0.0, 0.02, 0.10),
-    "torque": Range("of the limit", 0.0, 1.0, 4.0),
+    "torque": Range("of the limit", 0.0, 1.25, 4.0),
     "loop gap": Range("rad", 0.0, np.inf),
 }
 
@@ -137,7 +138,7 @@ def torques(robot: Robot, clip: MotionClip, points: np.ndarray, height: np.ndarr
     weight = np.repeat(np.clip(1 - height / BEARING, 0, 1), 3, axis=1)[:, :, None]
     jacobian = jacobian.reshape(len(clip), -1, model.nv)
     root = jacobian[:, :, :6]
-    gram = np.swapaxes(root, 1, 2) @ (weight * root) + 0.02 * np.eye(6)
+    gram = np.swapaxes(root, 1, 2) @ (weight * root) + DAMPING * np.eye(6)
     force = weight * (root @ np.linalg.solve(gram, needed[:, :6, None]))
     return np.abs(needed[:, 6:] - (np.swapaxes(jacobian[:, :, 6:], 1, 2) @ force)[..., 0])
 
