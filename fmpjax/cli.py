@@ -1,4 +1,4 @@
-"""The command line: ``fmpjax train``, ``evaluate``, ``render``, ``export``, ``config``."""
+"""The command line: ``fmpjax train``, ``evaluate``, ``render``, ``export``, ``config``, ``motion``."""
 
 import contextlib
 import dataclasses
@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 
 from fmpjax import config as configuration
+from fmpjax.cli_motion import Motion
 from fmpjax.errors import UserError
 
 
@@ -244,6 +245,7 @@ def _default_preset() -> str:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: bad input is one sentence and exit code 2."""
     commands = {"train": Train, "evaluate": Evaluate, "render": Render, "export": Export, "config": ShowConfig}
+    commands["motion"] = Motion
     command = tyro.extras.subcommand_cli_from_dict(
         commands, prog="fmpjax", description="Flow-Matched Motion Priors in JAX.", args=arguments
     )

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from fmpjax import motion, rotations
+from fmpjax import cli, motion, rotations
 from fmpjax.errors import UserError
-from fmpjax.motion import gait
+from fmpjax.motion import gait, soles
 
 STRIDE = 54  # samples
 
@@ -76,7 +76,7 @@ def test_arms_swing_against_the_legs(robot, walk):
 
 
 def test_heel_lands_first_and_toe_leaves_last(robot, walk):
-    points, _ = gait._sole_points(robot, walk.qpos[:STRIDE])
+    points, _ = soles.sole_points(robot, walk.qpos[:STRIDE])
     left = robot.sole_body == robot.sole_body[0]
     height = (points[:, :, 2] - robot.sole_radius)[:, left]
     heel = robot.sole_point[left, 0] < 0
@@ -291,28 +291,28 @@ def test_faults(robot):
         gait.synthesize(robot, style=gait.Style(heel_off=0.6))
 
 
-def test_command_writes_the_file(robot, tmp_path, monkeypatch):
-    monkeypatch.setattr("sys.argv", ["gait", "--out", str(tmp_path / "walk.npz"), "--duration", "1.1"])
-    gait.main()
+def synthesize(out, options):
+    cli.main(["motion", "synthesize", "--out", str(out), *options.split()])
+
+
+def test_command_writes_the_file(robot, tmp_path):
+    synthesize(tmp_path / "walk.npz", "--duration 1.1")
     assert len(motion.load(tmp_path / "walk.npz")) == STRIDE + 1
 
 
-def test_command_has_the_turn_and_the_style(robot, tmp_path, monkeypatch):
+def test_command_has_the_turn_and_the_style(robot, tmp_path):
     out = tmp_path / "turn.npz"
-    options = "--speed 0.6 --turn -0.3 --duration 3.3 --step-height 0.05 --style.pelvis-height 0.75"
-    monkeypatch.setattr("sys.argv", ["gait", "--out", str(out), *options.split()])
-    gait.main()
+    synthesize(out, "--speed 0.6 --turn -0.3 --duration 3.3 --step-height 0.05 --style.pelvis-height 0.75")
     figures = gait.measure(robot, motion.load(out))
     assert figures["turn"] == pytest.approx(-0.3)
     assert figures["clearance"] > 0.033
     assert figures["height_min"] < 0.74
 
 
-def test_command_says_what_is_wrong(tmp_path, monkeypatch, capsys):
+def test_command_says_what_is_wrong(tmp_path, capsys):
     out = tmp_path / "turn.npz"
-    monkeypatch.setattr("sys.argv", ["gait", "--out", str(out), "--speed", "-1"])
     with pytest.raises(SystemExit) as caught:
-        gait.main()
+        synthesize(out, "--speed -1")
     assert caught.value.code == 2
-    assert capsys.readouterr().err == "speed is -1.0, expected a positive number of m/s\n"
+    assert capsys.readouterr().err == "fmpjax: speed is -1.0, expected a positive number of m/s\n"
     assert not out.exists()

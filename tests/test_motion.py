@@ -221,7 +221,7 @@ def test_missing_files(tmp_path):
     fails(r"unknown robot 'h1': expected one of unitree_g1", "walk", robot="h1")
     other = tmp_path / "clip.bvh"
     other.write_text("HIERARCHY")
-    fails(r"clip\.bvh: unknown motion format '\.bvh', expected \.csv or \.npz", other)
+    fails(r"clip\.bvh: a BVH skeleton, expected a motion of robot 'unitree_g1'", other)
 
 
 @pytest.mark.parametrize(
@@ -259,7 +259,7 @@ def test_csv_bad_values(csv):
         edit(csv, 5, column, "0")
     fails(r"clip\.csv: line 5 has a root quaternion of length 0, expected a unit one", csv)
     csv.write_bytes(bytes(range(256)))
-    fails(r"clip\.csv: not a text file", csv)
+    fails(r"clip\.csv: neither text nor an archive nor a pickle", csv)
 
 
 @pytest.mark.parametrize("frames", ["5", "5:", "a:b", "1:2:3", (1, 2, 3), (1.5, 20), 7, ""])
@@ -295,9 +295,9 @@ def npz(path, **arrays):
 @pytest.mark.parametrize(
     ("arrays", "pattern"),
     [
-        ({"qpos": None}, r"a\.npz: no array named 'qpos', expected qpos, rate and robot"),
-        ({"rate": None}, r"no array named 'rate'"),
-        ({"robot": None}, r"no array named 'robot'"),
+        ({"qpos": None}, r"a\.npz: the file holds rate, robot, expected qpos, rate, robot \(fmpjax\) or"),
+        ({"rate": None}, r"the file holds qpos, robot, expected"),
+        ({"robot": None}, r"the file holds qpos, rate, expected"),
         ({"qpos": np.zeros((30, 30))}, r"shape \(30, 30\), expected numbers of shape \(T, 36\) .*29 joints"),
         ({"qpos": np.zeros(36)}, r"shape \(36,\), expected"),
         ({"qpos": np.full((30, 36), "x")}, r"expected numbers of shape"),
@@ -307,7 +307,7 @@ def npz(path, **arrays):
         ({"robot": "h1"}, r"the motion is for robot 'h1', expected 'unitree_g1'"),
         ({"rate": -1.0}, r"rate is -1.0, expected a positive number of Hz"),
         ({"rate": np.array([50.0, 30.0])}, r"rate is \[50.0, 30.0\], expected"),
-        ({"qpos": np.array([{}])}, r"not a readable \.npz archive"),
+        ({"qpos": np.array([{}])}, r"array 'qpos' holds object, expected numbers or text"),
     ],
 )
 def test_npz_faults(tmp_path, arrays, pattern):
@@ -317,16 +317,16 @@ def test_npz_faults(tmp_path, arrays, pattern):
 def test_npz_cut_short_or_another_file(tmp_path):
     path = npz(tmp_path / "a.npz")
     whole = path.read_bytes()
-    for size in (0, 10, len(whole) // 2, len(whole) - 1):
+    for size in (10, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:size])
-        fails(r"a\.npz: not a readable \.npz archive, expected arrays qpos, rate and robot", path)
+        fails(r"a\.npz: not a readable \.npz archive", path)
     damaged = bytearray(whole)
     damaged[len(whole) // 3] ^= 0xFF
     path.write_bytes(damaged)
     fails(r"a\.npz: not a readable \.npz archive", path)
     np.save(tmp_path / "b.npy", np.zeros((30, 36)))
     (tmp_path / "b.npy").rename(tmp_path / "b.npz")
-    fails(r"b\.npz: not a readable \.npz archive", tmp_path / "b.npz")
+    fails(r"b\.npz: neither text nor an archive nor a pickle", tmp_path / "b.npz")
 
 
 def test_save_needs_the_ending(csv, tmp_path):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fmpjax import motion, rotations
+from fmpjax import cli, motion, rotations
 from fmpjax.errors import UserError
-from fmpjax.motion import bvh, gait, retarget
+from fmpjax.motion import bvh, gait, retarget, soles
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 # Joints and their parents, by LaFAN1's names; what is a landmark of the robot; CMU's names.
@@ -120,7 +120,7 @@ def test_feet_stay_on_the_floor(robot, second, done):
     assert figures["limit_margin"] > 0.1
     assert figures["joint_acceleration"] < 1.3 * original["joint_acceleration"]
     # The feet that the source's heights and speeds let stand are those that touch the floor.
-    points, _ = gait._sole_points(robot, second.qpos)
+    points, _ = soles.sole_points(robot, second.qpos)
     low = points[:, :, 2] - robot.sole_radius < 0.002
     touch = np.stack(
         [low[:, robot.sole_body == robot.landmarks[f"{s}_ankle"]].any(axis=1) for s in ("left", "right")], 1
@@ -245,18 +245,18 @@ def test_namespaces_and_end_sites_are_understood(source):
     assert retarget._joints(source._replace(names=names), "walk") == retarget._joints(source, "walk")
 
 
-def test_command(robot, second, tmp_path, monkeypatch, capsys):
+def test_command(robot, second, tmp_path, capsys):
     pytest.importorskip("mink")
     path, out = tmp_path / "walk.bvh", tmp_path / "out" / "walk.npz"
     path.write_text(capture(robot, second))
-    monkeypatch.setattr("sys.argv", ["retarget", str(path), "--out", str(out)])
-    retarget.main()
+    command = ["motion", "retarget", str(path), "--out", str(out)]
+    cli.main(command)
     assert f"wrote {out}: {len(second)} frames at 30 Hz, 0.01 m per unit of the file" in capsys.readouterr().out
     assert motion.load(out, rate=30.0).qpos.shape == second.qpos.shape
     out.unlink()
     path.write_text("HIERARCHY\n")
     with pytest.raises(SystemExit) as caught:
-        retarget.main()
+        cli.main(command)
     assert caught.value.code == 2
     assert "no line MOTION" in capsys.readouterr().err
     assert not out.exists()

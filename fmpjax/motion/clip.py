@@ -50,7 +50,7 @@ def continuous(q_wxyz: np.ndarray) -> np.ndarray:
 def sample_count(rows: int, source_rate: float, rate: float) -> int:
     """Number of samples at ``rate`` from the first of ``rows`` source rows to the last one, both included."""
     # The slack keeps a last sample that falls on the grid from being lost to rounding.
-    return max(0, math.floor((rows - 1) * rate / source_rate + 1e-6) + 1)
+    return max(0, math.floor(min((rows - 1) * rate / source_rate, 1e15) + 1e-6) + 1)  # tiny rates give infinity
 
 
 def resample(qpos: np.ndarray, source_rate: float, rate: float) -> np.ndarray:

@@ -10,14 +10,12 @@ where the foot lands. Seen from a frame that moves along the arc and turns with 
 balance is found in the same way.
 
 Phases are fractions of a stride and start at the left heel's landing; of a straight walk, the right leg is the left
-one's mirror image half a stride later. Run ``python -m fmpjax.motion.gait --out motions/walk.npz`` to write the bundled
-walk; `LIBRARY` has the arguments of the other bundled motions.
+one's mirror image half a stride later. `LIBRARY` has the arguments of the bundled motions;
+``fmpjax motion synthesize`` is the command.
 """
 
 import dataclasses
 import math
-import sys
-from pathlib import Path
 from typing import Annotated
 
 import mujoco
@@ -25,10 +23,11 @@ import numpy as np
 import tyro
 from scipy.interpolate import BPoly
 
-from fmpjax import robots, rotations
+from fmpjax import rotations
 from fmpjax.errors import UserError
 from fmpjax.motion.clip import MotionClip
-from fmpjax.motion.formats import MOST_SAMPLES, save
+from fmpjax.motion.formats import MOST_SAMPLES
+from fmpjax.motion.soles import slip, sole_points
 from fmpjax.robots import Robot
 
 GRAVITY = 9.81  # m/s^2
@@ -442,7 +441,7 @@ def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[s
       across the path, around the points on the floor.
     """
     feet = list(dict.fromkeys(robot.sole_body.tolist()))
-    points, rotation = _sole_points(robot, clip.qpos)
+    points, rotation = sole_points(robot, clip.qpos)
     height = points[:, :, 2] - robot.sole_radius
     touch = height < contact
     down = np.stack([touch[:, robot.sole_body == foot].any(axis=1) for foot in feet], axis=1)
@@ -463,7 +462,7 @@ def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[s
         "height_min": float(clip.qpos[:, 2].min()),
         "height_max": float(clip.qpos[:, 2].max()),
         **dict(zip(names, sagittal.tolist(), strict=True)),
-        "slip": _slip(robot, points, rotation, touch),
+        "slip": slip(robot, points, rotation, touch),
         "penetration": float(max(0.0, -height.min())),
         "gap": float(height.min(axis=1).max()),
         "clearance": _clearance(height, [robot.sole_body == foot for foot in feet], down),
@@ -475,33 +474,6 @@ def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[s
         "lateral": float(np.ptp(sideways) / 2),
         "balance": _balance(robot, clip, points, height, heading),
     }
-
-
-def _sole_points(robot: Robot, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World centres of the sole spheres ``[T, P, 3]`` and rotation matrices of their bodies ``[T, P, 3, 3]``."""
-    data = mujoco.MjData(robot.model)
-    points = np.zeros((len(qpos), len(robot.sole_body), 3))
-    rotation = np.zeros((*points.shape, 3))
-    for i, row in enumerate(qpos):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(robot.model, data)
-        rotation[i] = data.xmat[robot.sole_body + 1].reshape(-1, 3, 3)
-        points[i] = data.xpos[robot.sole_body + 1] + np.einsum("pij,pj->pi", rotation[i], robot.sole_point)
-    return points, rotation
-
-
-def _slip(robot: Robot, points: np.ndarray, rotation: np.ndarray, touch: np.ndarray) -> float:
-    """Greatest distance (m) that a point slides over the floor while it touches without a break."""
-    turn = rotation[1:] @ np.swapaxes(rotation[:-1], -1, -2)
-    # Rotation vector of a small turn; the bottom of the sphere moves by the turn crossed with minus the radius.
-    vector = 0.5 * np.stack([turn[..., 2, 1] - turn[..., 1, 2], turn[..., 0, 2] - turn[..., 2, 0]], axis=-1)
-    rolled = robot.sole_radius[:, None] * np.stack([-vector[..., 1], vector[..., 0]], axis=-1)
-    moved = np.linalg.norm(points[1:, :, :2] - points[:-1, :, :2] + rolled, axis=-1)
-    worst, run = 0.0, np.zeros(points.shape[1])
-    for distance, both in zip(moved, touch[1:] & touch[:-1], strict=True):
-        run = np.where(both, run + distance, 0.0)
-        worst = max(worst, float(run.max()))
-    return worst
 
 
 def _clearance(height: np.ndarray, feet: list[np.ndarray], down: np.ndarray) -> float:
@@ -528,40 +500,3 @@ def _balance(robot: Robot, clip: MotionClip, points: np.ndarray, height: np.ndar
     low = np.where(near, spread, np.inf).min(axis=1)
     high = np.where(near, spread, -np.inf).max(axis=1)
     return float(np.sqrt(np.mean(np.sum((push - np.clip(push, low, high)) ** 2, axis=1))))
-
-
-def write(
-    out: Path,
-    robot: str = "unitree_g1",
-    speed: float = 0.85,
-    turn: float = 0.0,
-    duration: float = 8.0,
-    rate: float = 50.0,
-    style: Style = Style(),
-) -> None:
-    """Synthesise a walk and write it.
-
-    Args:
-      out: File to write, .npz.
-      robot: A robot under robots/.
-      speed: Along the path, m/s.
-      turn: To the left, rad/s.
-      duration: At most, s.
-      rate: Samples per second, Hz.
-      style: How the walk looks; lengths m, angles rad, phases as fractions of a stride.
-    """
-    machine = robots.load(robot)
-    save(synthesize(machine, speed=speed, turn=turn, duration=duration, rate=rate, style=style), out)
-
-
-def main() -> None:
-    """`write` as a command."""
-    try:
-        tyro.cli(write)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
-
-
-if __name__ == "__main__":
-    main()

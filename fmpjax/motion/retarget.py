@@ -5,10 +5,10 @@ length. A foot that stands in the source stands in the result: its sole lies on 
 without sliding. The source is taken to walk on one level floor, y up.
 
 Landmarks are the parts of the body that a robot names in ``robot.toml``. Poses are in the robot's axes: x ahead, y to
-the left, z up. Run ``python -m fmpjax.motion.retarget FILE.bvh --out FILE.npz``.
+the left, z up. `fmpjax motion retarget` is the
+command.
 """
 
-import argparse
 import itertools
 import math
 import os
@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 from scipy.ndimage import distance_transform_edt, median_filter, uniform_filter1d
 
-from fmpjax import robots, rotations
+from fmpjax import rotations
 from fmpjax.errors import UserError
 from fmpjax.motion import bvh
 from fmpjax.motion.bvh import Bvh
@@ -363,20 +363,3 @@ def _solve(robot: Robot, targets: Targets, rate: float) -> tuple[np.ndarray, np.
         qpos[t] = data.qpos
         residual[t] = np.sqrt(np.mean(np.sum((data.xpos[bodies] - wanted[t]) ** 2, axis=-1)))
     return qpos, residual
-
-
-def main() -> None:
-    """Retarget one file."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("file", type=Path, help="motion capture, .bvh")
-    parser.add_argument("--robot", default="unitree_g1")
-    parser.add_argument("--out", required=True, help="file to write, .npz")
-    arguments = parser.parse_args()
-    try:
-        print(convert(arguments.file, robots.load(arguments.robot), arguments.out))
-    except UserError as error:
-        parser.exit(2, f"{error}\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,154 @@
+"""Whether a clip is fit to learn from: figures with healthy ranges, and a verdict for each."""
+
+import copy
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from scipy.signal import savgol_filter
+
+from fmpjax import rotations
+from fmpjax.motion.clip import MotionClip
+from fmpjax.motion.edit import loop_target
+from fmpjax.motion.soles import slides, sole_points
+from fmpjax.robots import Robot
+
+CONTACT = 0.01  # m, a sole point below this height counts as standing
+BEARING = 0.03  # m, a sole point at this height bears nothing, one on the floor its share
+DAMPING = 1e-3  # keeps forces finite where few points are near the floor
+SMOOTHING = 0.07  # s, half of the window over which accelerations are fitted for the torques
+
+
+class Range(NamedTuple):
+    """A figure's unit, its healthy range, and from where on the clip is broken."""
+
+    unit: str
+    low: float
+    high: float
+    broken: float = np.inf
+
+
+RANGES = {
+    "duration": Range("s", 1.0, np.inf),
+    "speed": Range("m/s", 0.0, 4.0, 12.0),
+    "limit excess": Range("rad", 0.0, 0.02, 0.2),
+    "joint speed": Range("rad/s", 0.0, 20.0, 60.0),
+    "joint acceleration": Range("rad/s²", 0.0, 600.0, 2500.0),
+    "root acceleration": Range("m/s²", 0.0, 40.0, 200.0),
+    "root turn": Range("rad/s", 0.0, 10.0, 30.0),
+    "flips": Range("", 0, 0),
+    "foot slip": Range("m/s", 0.0, 0.3, 1.0),
+    "penetration": Range("m", 0.0, 0.02, 0.08),
+    "float": Range("m", 0.0, 0.02, 0.10),
+    "torque": Range("of the limit", 0.0, 1.25, 4.0),
+    "loop gap": Range("rad", 0.0, np.inf),
+}
+
+
+class Figure(NamedTuple):
+    """One figure of a clip; ``where`` names the joint or the time of the worst value."""
+
+    name: str
+    value: float
+    where: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """``good``, ``odd`` (outside the healthy range) or ``broken``."""
+        span = RANGES[self.name]
+        if not self.value < span.broken:
+            return "broken"
+        return "good" if span.low <= self.value <= span.high else "odd"
+
+
+def check(robot: Robot, clip: MotionClip, flips: int = 0) -> list[Figure]:
+    """The figures of a clip, in the order of `RANGES`.
+
+    ``duration``; ``speed``, the root's mean over the floor; ``limit excess`` of a joint beyond its limit; greatest
+    ``joint speed`` and, from second differences, ``joint acceleration``, ``root acceleration``; ``root turn``, its
+    greatest angular velocity; ``flips`` of the root quaternion's sign in the file; ``foot slip``, the mean speed over
+    the floor of sole points below `CONTACT`; ``penetration``, greatest; ``float``, the height of the lowest sole point
+    that is undercut a tenth of the time; ``torque``, the greatest share of a motor's limit, exceeded 1 % of the time;
+    ``loop gap``, the greatest angle between the last pose and the first.
+    """
+    joints, rate = clip.qpos[:, 7:], clip.rate
+    names, times = robot.joint_names, np.arange(len(clip)) / rate
+    points, rotation = sole_points(robot, clip.qpos)
+    height = points[..., 2] - robot.sole_radius
+    lowest = height.min(axis=1)
+    standing = (height[1:] < CONTACT) & (height[:-1] < CONTACT)
+    slide = slides(robot, points, rotation)[standing] * rate
+    share = torques(robot, clip, points, height) / robot.effort
+    greatest = np.percentile(share.max(axis=1), 99)
+    target, last = loop_target(clip), clip.qpos[-1]
+    tilt = np.linalg.norm(rotations.log_map(rotations.multiply(rotations.conjugate(last[3:7]), target[3:7])))
+
+    def worst(name: str, values: np.ndarray, first: int = 0) -> Figure:
+        row, column = np.unravel_index(np.argmax(values), values.shape)
+        what = f"{names[column]} at " if values.shape[1] == len(names) else "at "
+        return Figure(name, float(values[row, column]), f"{what}{times[row + first]:.2f} s")
+
+    excess = np.maximum(0, np.maximum(robot.joint_low - joints, joints - robot.joint_high))
+    limit = worst("limit excess", excess)
+    return [
+        Figure("duration", clip.duration),
+        Figure("speed", float(np.linalg.norm(np.diff(clip.qpos[:, :2], axis=0), axis=1).mean() * rate)),
+        limit if limit.value else Figure("limit excess", 0.0),
+        worst("joint speed", np.abs(np.diff(joints, axis=0)) * rate),
+        worst("joint acceleration", np.abs(np.diff(joints, 2, axis=0)) * rate**2, 1),
+        worst("root acceleration", np.linalg.norm(np.diff(clip.qpos[:, :3], 2, axis=0), axis=1)[:, None] * rate**2, 1),
+        worst("root turn", np.linalg.norm(clip.qvel[:, 3:6], axis=1)[:, None]),
+        Figure("flips", flips, "taken out on reading" if flips else ""),
+        Figure("foot slip", float(slide.mean()) if len(slide) else 0.0, "" if len(slide) else "nothing stands"),
+        worst("penetration", np.maximum(0.0, -lowest)[:, None]),
+        Figure("float", float(max(0.0, np.percentile(lowest, 10)))),
+        Figure("torque", float(greatest), names[int(np.argmax(np.percentile(share, 99, axis=0)))]),
+        Figure("loop gap", float(max(tilt, np.abs(last[7:] - target[7:]).max()))),
+    ]
+
+
+def flips(q_wxyz: np.ndarray) -> int:
+    """How often the sign of quaternions ``[T, 4]`` changes between samples that are the same orientation nearly."""
+    return int(np.count_nonzero(np.sum(q_wxyz[1:] * q_wxyz[:-1], axis=1) < 0))
+
+
+def torques(robot: Robot, clip: MotionClip, points: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Motor torques that the motion asks for, magnitudes ``[T, J]`` N m.
+
+    Inverse dynamics gives the wrench that must act on the root, and torques as if it did. The floor gives that wrench
+    instead: the least forces at sole points near the floor (``points [T, P, 3]``, ``height [T, P]`` m) that sum to it,
+    each weighted by its nearness. Forces may pull and know no friction, and what nothing near the floor can give is
+    left out: an estimate, good enough to tell a motor's limit from a multiple of it. Velocities are fitted by parabolas
+    over twice `SMOOTHING`, or the interpolation between frames would pass for jolts.
+    """
+    model, data = copy.copy(robot.model), mujoco.MjData(robot.model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    window = min(2 * max(2, round(SMOOTHING * clip.rate)) + 1, len(clip) - 1 + len(clip) % 2)
+    speed = savgol_filter(clip.qvel, window, 2, axis=0)
+    acceleration = savgol_filter(clip.qvel, window, 2, deriv=1, delta=1 / clip.rate, axis=0)
+    bottom = points - [0.0, 0.0, 1.0] * robot.sole_radius[:, None]
+    needed = np.zeros((len(clip), model.nv))
+    jacobian = np.zeros((len(clip), points.shape[1], 3, model.nv))
+    for i in range(len(clip)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = clip.qpos[i], speed[i], acceleration[i]
+        mujoco.mj_inverse(model, data)
+        needed[i] = data.qfrc_inverse
+        for p, body in enumerate(robot.sole_body):
+            mujoco.mj_jac(model, data, jacobian[i, p], None, bottom[i, p], body + 1)
+    weight = np.repeat(np.clip(1 - height / BEARING, 0, 1), 3, axis=1)[:, :, None]
+    jacobian = jacobian.reshape(len(clip), -1, model.nv)
+    root = jacobian[:, :, :6]
+    gram = np.swapaxes(root, 1, 2) @ (weight * root) + DAMPING * np.eye(6)
+    force = weight * (root @ np.linalg.solve(gram, needed[:, :6, None]))
+    return np.abs(needed[:, 6:] - (np.swapaxes(jacobian[:, :, 6:], 1, 2) @ force)[..., 0])
+
+
+def table(figures: list[Figure]) -> str:
+    """The figures as lines of text: value, healthy range, verdict."""
+    lines = []
+    for figure in figures:
+        span = RANGES[figure.name]
+        healthy = f"{span.low:g} to {span.high:g}" if np.isfinite(span.high) else f"from {span.low:g}"
+        value = f"{figure.value:.3g} {span.unit}"
+        lines.append(f"{figure.name:<19}{value:<20}{healthy:<12}{figure.verdict:<8}{figure.where}".rstrip())
+    return "\n".join([f"{'figure':<19}{'value':<20}{'healthy':<12}verdict", *lines])

@@ -1,0 +1,119 @@
+"""A clip to look at: in MuJoCo's viewer, as a contact sheet or video, as curves."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from fmpjax.errors import UserError
+from fmpjax.motion.clip import MotionClip
+from fmpjax.motion.soles import sole_points
+from fmpjax.robots import Robot
+from fmpjax.viz import render
+
+PICTURES, COLUMNS = 20, 5  # of a contact sheet
+VIDEO_FPS = 50.0  # Hz, at most
+SIDES = ("left_", "right_")
+COLOURS = ("#2a6fb0", "#c8553d", "#3a8a6b")  # left, right, neither
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    return sys.platform in ("darwin", "win32") or any(os.environ.get(v) for v in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def play(robot: Robot, clip: MotionClip) -> None:
+    """Show the clip in MuJoCo's viewer, again and again, until its window is closed."""
+    import mujoco.viewer
+
+    data = mujoco.MjData(robot.model)
+    with mujoco.viewer.launch_passive(robot.model, data) as viewer:
+        start = time.perf_counter()
+        while viewer.is_running():
+            data.qpos[:] = clip.qpos[int((time.perf_counter() - start) * clip.rate) % len(clip)]
+            mujoco.mj_forward(robot.model, data)
+            viewer.sync()
+            time.sleep(1 / clip.rate)
+
+
+def picture(robot: Robot, clip: MotionClip, path: str | Path) -> Path:
+    """Write the clip as a contact sheet (``.png``) or a video (``.mp4``, ``.gif``); returns the path written.
+
+    Raises:
+      UserError: the name has another ending, or the path cannot be written.
+    """
+    path = Path(path)
+    if path.suffix == ".png":
+        rows = np.unique(np.linspace(0, len(clip) - 1, PICTURES).round().astype(int))
+        labels = [f"{row / clip.rate:.2f} s" for row in rows]
+        # Each picture has its robot in the middle: rows so far apart leave the camera's smooth path.
+        poses = clip.qpos[rows] * np.where(np.arange(clip.qpos.shape[1]) < 2, 0.0, 1.0)
+        frames = render.render_frames(robot, poses, width=240, height=240, labels=labels)
+        return render.contact_sheet(path, frames, COLUMNS)
+    if path.suffix not in (".mp4", ".gif"):
+        raise UserError(f"cannot show a motion as {path}: expected a name that ends in .png, .mp4 or .gif")
+    every = max(1, int(np.ceil(clip.rate / VIDEO_FPS)))
+    return render.write_video(path, render.render_frames(robot, clip.qpos[::every]), clip.rate / every)
+
+
+def plot(robot: Robot, clip: MotionClip, path: str | Path) -> Path:
+    """Draw root height, speed, heights of the feet and every joint against its limits as one PNG; returns its path.
+
+    Raises:
+      UserError: the name does not end in ``.png``, or the path cannot be written.
+    """
+    path = Path(path)
+    if path.suffix != ".png":
+        raise UserError(f"cannot plot a motion as {path}: expected a name that ends in .png")
+    times = np.arange(len(clip)) / clip.rate
+    groups: dict[str, list[int]] = {}
+    for i, name in enumerate(robot.joint_names):
+        groups.setdefault(name.removeprefix(SIDES[0]).removeprefix(SIDES[1]), []).append(i)
+    rows = 1 + -(-len(groups) // 4)
+    figure = Figure((13, 1.9 * rows), dpi=90, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, 4, sharex=True)
+    _root(panels[0], robot, clip, times)
+    for panel, (name, joints) in zip(panels[1:].flat, groups.items(), strict=False):
+        panel.set_title(f"{name.removesuffix('_joint').replace('_', ' ')}, rad", fontsize=9)
+        for joint in joints:
+            colour = COLOURS[_side(robot.joint_names[joint])]
+            panel.plot(times, clip.qpos[:, 7 + joint], color=colour, linewidth=1)
+            for limit in (robot.joint_low[joint], robot.joint_high[joint]):
+                panel.axhline(limit, color=colour, linewidth=0.8, linestyle=":")
+    for panel in panels[1:].flat[len(groups) :]:
+        panel.set_axis_off()
+    for panel in panels[-1]:
+        panel.set_xlabel("s", fontsize=9)
+    figure.suptitle(f"{clip.name}: left blue, right red; dotted: limits", fontsize=10)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
+    return path
+
+
+def _root(panels: np.ndarray, robot: Robot, clip: MotionClip, times: np.ndarray) -> None:
+    """The first row: the root's height, speed and turning, and the feet's heights."""
+    points, _ = sole_points(robot, clip.qpos)
+    height = points[..., 2] - robot.sole_radius
+    drawn = {"root height, m": clip.qpos[:, 2], "speed, m/s": np.linalg.norm(clip.qvel[:, :2], axis=1)}
+    for panel, (title, values) in zip(panels, drawn.items(), strict=False):
+        panel.set_title(title, fontsize=9)
+        panel.plot(times, values, color=COLOURS[2], linewidth=1)
+    feet, turn = panels[2:]
+    feet.set_title("lowest point of each foot, m", fontsize=9)
+    for foot, colour in zip(dict.fromkeys(robot.sole_body.tolist()), COLOURS, strict=False):
+        feet.plot(times, height[:, robot.sole_body == foot].min(axis=1), color=colour, linewidth=1)
+    feet.axhline(0, color="black", linewidth=0.8, linestyle=":")
+    turn.set_title("turning speed, rad/s", fontsize=9)
+    turn.plot(times, np.linalg.norm(clip.qvel[:, 3:6], axis=1), color=COLOURS[2], linewidth=1)
+
+
+def _side(joint: str) -> int:
+    return next((i for i, side in enumerate(SIDES) if joint.startswith(side)), 2)

@@ -1,0 +1,271 @@
+"""Edits against closed forms and MuJoCo's kinematics, figures against clips with one known fault, and the commands."""
+
+import os
+import time
+
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+from fmpjax import cli, motion, robots, rotations
+from fmpjax.errors import UserError
+from fmpjax.motion import MotionClip, check, edit, soles
+from fmpjax.viz import clip as show
+
+
+def changed(clip, change):
+    qpos = clip.qpos.copy()
+    change(qpos)
+    return MotionClip.from_qpos(clip.name, clip.robot, clip.rate, qpos)
+
+
+def figures(robot, clip, flips=0):
+    return {figure.name: figure for figure in check.check(robot, clip, flips)}
+
+
+@pytest.fixture(scope="module")
+def lively(robot, walk):
+    """The walk with every joint moved off its symmetric place."""
+    shift = np.random.default_rng(0).uniform(0.05, 0.15, robot.joint_count)
+
+    def change(qpos):
+        qpos[:, 7:] += shift
+        qpos[:, 1] += 0.3
+        qpos[:, 3:7] = rotations.multiply(rotations.exp_map(np.array([0.1, 0.2, 0.4])), qpos[:, 3:7])
+
+    return changed(walk, change)
+
+
+# --- edits -----------------------------------------------------------------------------------------------------------
+
+
+def test_mirror_twice_is_the_identity(robot, lively):
+    once = edit.mirrored(robot, lively)
+    assert np.abs(once.qpos - lively.qpos).max() > 0.2
+    np.testing.assert_allclose(edit.mirrored(robot, once).qpos, lively.qpos, atol=1e-12)
+
+
+def test_mirrored_key_points_are_reflections(robot, lively):
+    data = mujoco.MjData(robot.model)
+
+    def places(clip):
+        found = []
+        for data.qpos[:] in clip.qpos[::40]:
+            mujoco.mj_kinematics(robot.model, data)
+            turn = data.xmat[robot.key_body + 1].reshape(-1, 3, 3)
+            found.append(data.xpos[robot.key_body + 1] + np.einsum("kij,kj->ki", turn, robot.key_offset))
+        return dict(zip(robot.key_point_names, np.swapaxes(found, 0, 1), strict=True))
+
+    plain, image = places(lively), places(edit.mirrored(robot, lively))
+    for name, at in plain.items():
+        partner = name.replace("left", "?").replace("right", "left").replace("?", "right")
+        # The maker's model is symmetric to a hundredth of a millimetre in the arms, a millimetre in the torso's chain.
+        np.testing.assert_allclose(image[partner], at * [1, -1, 1], atol=5e-4)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 90.0, -135.0])
+def test_heading(robot, lively, degrees):
+    turned = edit.headed(lively, np.radians(degrees))
+    way = turned.qpos[-1, :2] - turned.qpos[0, :2]
+    assert np.degrees(np.arctan2(way[1], way[0])) == pytest.approx(degrees)
+    np.testing.assert_allclose(turned.qpos[0, :3], lively.qpos[0, :3])
+    np.testing.assert_allclose(turned.qpos[:, 7:], lively.qpos[:, 7:])
+    # Seen from the body nothing changes.
+    np.testing.assert_allclose(turned.qvel[:, 3:], lively.qvel[:, 3:], atol=1e-9)
+    seen = [rotations.rotate(rotations.conjugate(c.qpos[:, 3:7]), c.qvel[:, :3]) for c in (turned, lively)]
+    np.testing.assert_allclose(*seen, atol=1e-9)
+
+
+def test_no_heading_without_a_way(robot):
+    with pytest.raises(UserError, match="it has no heading"):
+        edit.headed(MotionClip.from_qpos("still", robot.name, 50.0, np.tile(robot.default_qpos, (20, 1))), 0.0)
+
+
+def test_loop_meets_its_start(robot, walk):
+    open_ = MotionClip.from_qpos("open", walk.robot, walk.rate, walk.qpos[:91])
+    closed = edit.looped(open_)
+    assert figures(robot, open_)["loop gap"].value > 0.3
+    assert figures(robot, closed)["loop gap"].value < 1e-9
+    np.testing.assert_array_equal(closed.qpos[:70, 7:], open_.qpos[:70, 7:])
+    np.testing.assert_allclose(closed.qpos[:, :2], open_.qpos[:, :2])
+    assert closed.qpos[-1, 2] == pytest.approx(open_.qpos[0, 2])
+
+
+def test_fix_puts_the_clip_right(robot, walk):
+    def spoil(qpos):
+        qpos[:, 2] += 0.07
+        qpos[20:25, 10] = robot.joint_high[3] + 0.4
+
+    clip, said = edit.fixed(robot, changed(walk, spoil))
+    assert said[0] == "left_knee_joint clipped in 5 samples, by 0.400 rad at most"
+    assert said[1].startswith("moved down by 70.")
+    found = figures(robot, clip)
+    assert found["limit excess"].value == 0
+    assert found["float"].value < 0.001
+    assert edit.fixed(robot, clip)[1] == []
+
+
+# --- figures ---------------------------------------------------------------------------------------------------------
+
+
+def test_bundled_walk_is_good(robot, walk):
+    found = check.check(robot, walk)
+    assert [f.name for f in found] == list(check.RANGES)
+    assert {f.verdict for f in found} == {"good"}
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "value", "verdict"),
+    [
+        ("penetration", lambda q: np.subtract.at(q, (slice(None), 2), 0.1), 0.1, "broken"),
+        ("penetration", lambda q: np.subtract.at(q, (slice(None), 2), 0.03), 0.03, "odd"),
+        ("float", lambda q: np.add.at(q, (slice(None), 2), 0.05), 0.05, "odd"),
+        ("float", lambda q: np.add.at(q, (slice(None), 2), 0.2), 0.2, "broken"),
+        ("speed", lambda q: np.multiply.at(q, (slice(None), 0), 20), 17.0, "broken"),
+        ("limit excess", lambda q: np.put(q, 100 * 36 + 7 + 3, -0.587267), 0.5, "broken"),
+        # One sample off by 0.5 m: a second difference of twice that.
+        ("root acceleration", lambda q: np.add.at(q, (100, 1), 0.5), 2 * 0.5 * 50**2, "broken"),
+        ("joint acceleration", lambda q: np.add.at(q, (100, 20), 1.0), 2 * 1.0 * 50**2, "broken"),
+        ("joint speed", lambda q: np.add.at(q, (slice(100, None), 20), 1.3), 1.3 * 50, "broken"),
+    ],
+)
+def test_each_fault_has_its_figure(robot, walk, name, change, value, verdict):
+    figure = figures(robot, changed(walk, change))[name]
+    assert figure.value == pytest.approx(value, rel=0.05)
+    assert figure.verdict == verdict
+
+
+def test_sliding_feet(robot):
+    """A robot that stands and is pushed over the floor at 0.5 m/s slips at that speed; one that stands does not."""
+    still = np.tile(robot.default_qpos, (30, 1))
+    clip = MotionClip.from_qpos("still", robot.name, 50.0, still)
+    assert figures(robot, clip)["foot slip"].value == pytest.approx(0, abs=1e-12)
+    still[:, 1] = 0.5 * np.arange(30) / 50
+    found = figures(robot, MotionClip.from_qpos("pushed", robot.name, 50.0, still))
+    assert found["foot slip"].value == pytest.approx(0.5)
+    assert found["speed"].value == pytest.approx(0.5)
+
+
+def test_flips_are_counted():
+    q = np.tile([0.6, 0.8, 0.0, 0.0], (10, 1))
+    q[3:5] *= -1
+    assert check.flips(q) == 2
+    assert check.Figure("flips", 2).verdict == "odd"
+
+
+def test_not_a_number_is_broken():
+    assert check.Figure("speed", float("nan")).verdict == "broken"
+
+
+def test_torques_of_a_crouch_are_those_of_statics(robot):
+    """Moment about the knee of half the weight, under the mass centre, less that of shank and foot."""
+    crouch, index = robot.default_qpos.copy(), robot.joint_names.index
+    for side in ("left", "right"):
+        for joint, angle in (("hip_pitch", -0.7), ("knee", 1.2), ("ankle_pitch", -0.5)):
+            crouch[7 + index(f"{side}_{joint}_joint")] = angle
+    crouch[2] -= robots.lowest_sole(robot, crouch)
+    clip = MotionClip.from_qpos("still", robot.name, 50.0, np.tile(crouch, (15, 1)))
+    points, _ = soles.sole_points(robot, clip.qpos)
+    torque = check.torques(robot, clip, points, points[..., 2] - robot.sole_radius)[7]
+    data = mujoco.MjData(robot.model)
+    data.qpos[:] = crouch
+    mujoco.mj_forward(robot.model, data)
+    for side in ("left", "right"):
+        knee = robot.model.body(f"{side}_knee_link").id
+        foot = robot.model.body_subtreemass[knee] * (data.subtree_com[knee, 0] - data.xpos[knee, 0])
+        whole = robot.total_mass / 2 * (data.subtree_com[1, 0] - data.xpos[knee, 0])
+        assert torque[index(f"{side}_knee_joint")] == pytest.approx(9.81 * abs(whole - foot), rel=0.03)
+        assert torque[index(f"{side}_knee_joint")] > 15
+
+
+def test_three_thousand_frames_are_quick(robot, walk):
+    clip = MotionClip.from_qpos("long", walk.robot, walk.rate, np.tile(walk.qpos, (8, 1))[:3000])
+    start = time.process_time()
+    check.check(robot, clip)
+    assert time.process_time() - start < 4  # 0.2 s on an idle core
+
+
+# --- commands --------------------------------------------------------------------------------------------------------
+
+
+def run(*arguments):
+    cli.main(["motion", *map(str, arguments)])
+
+
+def code(*arguments):
+    with pytest.raises(SystemExit) as end:
+        run(*arguments)
+    return end.value.code
+
+
+def test_import_check_and_synthesize(tmp_path, capsys, robot):
+    run("synthesize", "--speed", "0.7", "--duration", "1.2", "--out", tmp_path / "a.npz")
+    run(
+        "import",
+        tmp_path / "a.npz",
+        "--out",
+        tmp_path / "b.npz",
+        "--mirror",
+        "--heading",
+        "90",
+        "--loop",
+        "--rate",
+        "30",
+    )
+    clip = motion.load(tmp_path / "b.npz", rate=30.0)
+    assert clip.qpos[-1, 1] - clip.qpos[0, 1] == pytest.approx(0.7 * clip.duration, rel=0.05)
+    run("import", tmp_path / "a.npz", "walk", "--out", tmp_path / "both")
+    assert sorted(p.name for p in (tmp_path / "both").iterdir()) == ["a.npz", "walk.npz"]
+    run("check", tmp_path / "both" / "walk.npz")
+    assert "broken" not in capsys.readouterr().out
+
+
+def test_broken_clip_is_exit_code_one_until_it_is_fixed(tmp_path, capsys, walk):
+    def sink(qpos):
+        qpos[:, 2] -= 0.2
+
+    path = motion.save(changed(walk, sink), tmp_path / "sunk.npz")
+    assert code("check", path) == 1
+    assert "penetration        0.2 m               0 to 0.02   broken" in capsys.readouterr().out
+    run("check", path, "--fix", "--out", tmp_path / "up.npz")
+    assert "moved up by 200.0 mm" in capsys.readouterr().out
+    run("check", tmp_path / "up.npz")
+
+
+def test_pictures(tmp_path, robot, walk, monkeypatch):
+    monkeypatch.setattr(show.render, "backend", lambda: "skeleton")
+    run("plot", "walk", "--frames", "0:60", "--out", tmp_path / "plot.png")
+    run("view", "walk", "--frames", "0:40", "--out", tmp_path / "sheet.png")
+    assert Image.open(tmp_path / "plot.png").size[0] > 1000
+    assert Image.open(tmp_path / "sheet.png").size == (5 * 244 - 4, 4 * 244 - 4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("import", "nope", "--out", "a.npz"), "unknown motion 'nope'"),
+        (("import", "walk", "--out", "a.csv"), "expected a name ending in .npz"),
+        (("import", "walk", "walk", "--out", "a"), "same name"),
+        (("import", "walk", "--out", "a.npz", "--heading", "nan"), "--heading is nan"),
+        (("import", "walk", "--out", "a.npz", "--fps", "0"), "fps is 0"),
+        (("check", "walk", "--fix"), "--fix and --out go together"),
+        (("check", "walk", "--frames", "0:3"), "4 frames, expected at least 11"),
+        (("check", "walk", "--robot", "h1"), "unknown robot 'h1'"),
+        (("view", "walk", "--out", "a.bmp"), "expected a name that ends in .png, .mp4 or .gif"),
+        (("plot", "walk", "--out", "a.pdf"), "expected a name that ends in .png"),
+        (("synthesize", "--out", "a.npz", "--speed", "-1"), "speed is -1"),
+    ],
+)
+def test_bad_input(tmp_path, monkeypatch, capsys, arguments, word):
+    monkeypatch.chdir(tmp_path)
+    assert code(*arguments) == 2
+    error = capsys.readouterr().err
+    assert word in error and error.count("\n") == 1
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(("name", "frames"), [("walk1_subject1.csv", "2370:2580"), ("run1_subject2.csv", "5000:5200")])
+def test_real_clips_are_fit(robot, external, name, frames):
+    clip = motion.load(external(name), frames=frames)
+    assert "broken" not in {figure.verdict for figure in check.check(robot, clip)}
