@@ -1,7 +1,8 @@
 """Whether path supervision makes a better reward beyond the rollout that it was fitted on (Table II).
 
 FMP, Endpoint and Value are fitted to the windows of a standing policy and compared with references that they never saw,
-also along rollout-to-expert paths (Fig. mechanism, a and b). Run as ``python -m fmpjax.experiments.generalization --run STANDING --walking WALKING --out FOLDER``.
+also along rollout-to-expert paths (Fig. mechanism, a and b). Run as
+``python -m fmpjax.experiments.generalization --run STANDING --walking WALKING --out FOLDER``.
 """
 
 from collections.abc import Mapping

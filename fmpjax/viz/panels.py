@@ -42,7 +42,7 @@ def draw(path: Path, panels: Sequence[Panel], *, width: float = 3.6, height: flo
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         for label, line in panel.lines.items():
             (handles[label],) = axes.plot(
-                line.x, line.y, line.style or "none", color=line.colour, marker=line.marker, linewidth=1.5,
+                line.x, line.y, linestyle=line.style or "none", color=line.colour, marker=line.marker, linewidth=1.5,
                 markersize=5, markerfacecolor="white" if line.hollow else line.colour, zorder=3 if line.hollow else 2,
             )  # fmt: skip
         axes.set_title(panel.title, fontsize=9, loc="left")
