@@ -9,6 +9,7 @@ import html
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -25,10 +26,10 @@ class Section(NamedTuple):
     """One result."""
 
     title: str
-    tables: Sequence[Table]
+    table: Table | None  # None where nothing was measured, as below
     verdicts: Sequence[Verdict]
     picture: Path | None
-    source: Path | None  # file of its figures; None where nothing was measured
+    source: Path | None  # file of its figures
     provenance: Mapping[str, Any]
     command: str  # that makes it
 
@@ -49,68 +50,59 @@ def gather(folder: Path) -> list[Section]:
     """
     if not folder.is_dir():
         raise UserError(f"{folder} is not a folder: expected one with results of the experiments")
-    sections = [_comparison(folder), *(_study(folder, title, module) for title, module in _STUDIES)]
+    sections = [
+        _section(folder, "The matched comparison (Table I)", "ablate", COMPARISON, "curves.png", _comparison),
+        *(
+            _section(folder, title, module.NAME, f"{module.NAME}.json", f"{module.NAME}.png", partial(_study, module))
+            for title, module in _STUDIES
+        ),
+    ]
     if not any(section.source for section in sections):
         names = ", ".join([COMPARISON, *(f"{module.NAME}.json" for _, module in _STUDIES)])
         raise UserError(f"no results below {folder}: expected one of {names}")
     return sections
 
 
-def _find(folder: Path, name: str) -> Path | None:
-    return min(folder.rglob(name), key=lambda path: (len(path.parts), path), default=None)
-
-
-def _read(path: Path, build: Callable[[dict[str, Any]], Section]) -> Section:
+def _section(
+    folder: Path,
+    title: str,
+    module: str,
+    name: str,
+    picture: str,
+    read: Callable[[dict[str, Any]], tuple[Table, list[Verdict]]],
+) -> Section:
+    """The section of the file called ``name`` that lies nearest below ``folder``, with the picture beside it."""
+    command = f"python -m fmpjax.experiments.{module} --out FOLDER"
+    path = min(folder.rglob(name), key=lambda path: (len(path.parts), path), default=None)
+    if path is None:
+        return Section(title, None, (), None, None, {}, command)
     try:
-        return build(json.loads(path.read_text()))
+        record = json.loads(path.read_text())
+        drawn = path.with_name(picture)
+        shown = drawn if drawn.exists() else None
+        return Section(title, *read(record), shown, path, record["provenance"], command)
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         raise UserError(
-            f"{path} is not a result of this version ({type(error).__name__} {error}): write it anew"
+            f"{path} is no result of this version ({type(error).__name__}: {error}): write it anew with {command}"
         ) from None
 
 
-def _comparison(folder: Path) -> Section:
-    title, command = "The matched comparison (Table I)", "python -m fmpjax.experiments.ablate --out FOLDER"
-    path = _find(folder, COMPARISON)
-    if path is None:
-        return Section(title, (), (), None, None, {}, command)
-
-    def build(record: dict[str, Any]) -> Section:
-        final = table.final(record["evaluations"])
-        headings, lines = table.lines(final)
-        caption = "Last evaluations; means over seeds and their 95 % intervals where there are several"
-        return Section(
-            title, (Table(caption, headings, lines),), table.verdicts(final), _picture(path.with_name("curves.png")), path,
-            record["provenance"], command,
-        )  # fmt: skip
-
-    return _read(path, build)
+def _comparison(record: Mapping[str, Any]) -> tuple[Table, list[Verdict]]:
+    final = table.final(record["evaluations"])
+    caption = "Last evaluations; means over seeds, with their 95 % intervals where there are several"
+    return Table(caption, *table.lines(final)), table.verdicts(final)
 
 
-def _study(folder: Path, title: str, module: ModuleType) -> Section:
-    command = f"python -m fmpjax.experiments.{module.NAME} --out FOLDER"
-    path = _find(folder, f"{module.NAME}.json")
-    if path is None:
-        return Section(title, (), (), None, None, {}, command)
-    return _read(
-        path,
-        lambda record: Section(
-            title, (module.table(record),), module.verdicts(record), _picture(path.with_suffix(".png")), path,
-            record["provenance"], command,
-        ),
-    )  # fmt: skip
-
-
-def _picture(path: Path) -> Path | None:
-    return path if path.exists() else None
+def _study(module: ModuleType, record: Mapping[str, Any]) -> tuple[Table, list[Verdict]]:
+    return module.table(record), module.verdicts(record)
 
 
 # --- the pages -------------------------------------------------------------------------------------------------------
 
 _TITLE = "Flow-Matched Motion Priors: what was found here"
 _LEAD = (
-    "Figures of our own runs, the paper's beside them. The sentences below a table say whether the paper's results hold "
-    "here; they are computed from the figures."
+    "Figures of our own runs, the paper's beside them. The sentences below a table say whether the paper's results "
+    "hold here; they are computed from the figures."
 )
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #25303c; max-width: 72rem; margin: 2rem auto; padding: 0 1.5rem }
@@ -146,8 +138,7 @@ def page(sections: Sequence[Section], videos: Sequence[Path], root: Path) -> str
         if section.source is None:
             parts.append(f"<p>Not measured here; <code>{html.escape(section.command)}</code> does so.</p>")
             continue
-        parts += [_html_table(each) for each in section.tables]
-        parts += ['<ul class="verdicts">', *map(_html_verdict, section.verdicts), "</ul>"]
+        parts += [_html_table(section.table), '<ul class="verdicts">', *map(_html_verdict, section.verdicts), "</ul>"]
         if section.picture:
             parts.append(f'<img alt="{html.escape(section.title)}" src="{_data(section.picture, "image/png")}">')
         parts.append(f'<p class="source">{_source(section, root, html.escape, "<code>{}</code>".format)}</p>')
@@ -178,7 +169,7 @@ def text(sections: Sequence[Section], videos: Sequence[Path], root: Path, out: P
         if section.source is None:
             parts.append(f"Not measured here; `{section.command}` does so.")
             continue
-        parts += [results.markdown(each) for each in section.tables]
+        parts.append(results.markdown(section.table))
         parts.append(
             "\n".join(
                 f"- **{'Holds' if v.holds else 'Does not hold'}.** {v.claim}: {v.found}." for v in section.verdicts
