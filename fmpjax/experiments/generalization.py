@@ -58,8 +58,8 @@ def table(record: Mapping[str, Any]) -> Table:
         lines.append([f"{TITLES[name]}, the paper's", *(number(PAPER[name].get(key)) for key in COLUMNS)])
     size = record["settings"]
     caption = (
-        f"Reward generalization after {size['updates']:,} updates on {32 * size['environments']:,} windows of a policy "
-        f"that stands ({record['policies']['pool_speed']:.2f} m/s), against references of {size['banks']} banks"
+        f"Reward generalization after {size['updates']:,} updates on {32 * size['environments']:,} windows of the "
+        f"standing policy ({record['policies']['pool_speed']:.2f} m/s), against references of {size['banks']} banks"
     )
     return Table(caption, ["prior", *COLUMNS.values()], lines)
 
