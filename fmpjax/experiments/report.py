@@ -89,8 +89,10 @@ def _section(
 
 def _comparison(record: Mapping[str, Any]) -> tuple[Table, list[Verdict]]:
     final = table.final(record["evaluations"])
+    headings, lines = table.lines(final)
     caption = "Last evaluations; means over seeds, with their 95 % intervals where there are several"
-    return Table(caption, *table.lines(final)), table.verdicts(final)
+    named = [[f"{reset}: {method}", *cells] for reset, method, *cells in lines]
+    return Table(caption, ["reset: method", *headings[2:]], named), table.verdicts(final)
 
 
 def _study(module: ModuleType, record: Mapping[str, Any]) -> tuple[Table, list[Verdict]]:
@@ -100,10 +102,6 @@ def _study(module: ModuleType, record: Mapping[str, Any]) -> tuple[Table, list[V
 # --- the pages -------------------------------------------------------------------------------------------------------
 
 _TITLE = "Flow-Matched Motion Priors: what was found here"
-_LEAD = (
-    "Figures of our own runs, the paper's beside them. The sentences below a table say whether the paper's results "
-    "hold here; they are computed from the figures."
-)
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #25303c; max-width: 72rem; margin: 2rem auto; padding: 0 1.5rem }
 h1 { font-size: 1.7rem; line-height: 1.25 } h2 { font-size: 1.25rem; margin-top: 2.8rem }
@@ -126,12 +124,20 @@ code { font-size: .9em; background: #f2f4f6; padding: .1em .3em; border-radius: 
 """
 
 
+def _lead(sections: Sequence[Section]) -> str:
+    verdicts = [verdict for section in sections for verdict in section.verdicts]
+    return (
+        "Figures of our own runs, the paper's beside them. The sentences below a table say whether the paper's claims "
+        f"hold here; they are computed from the figures, and {sum(v.holds for v in verdicts)} of {len(verdicts)} hold."
+    )
+
+
 def page(sections: Sequence[Section], videos: Sequence[Path], root: Path) -> str:
     """The report as one HTML page that holds all it shows."""
     parts = [
         "<!doctype html>", '<html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">', f"<title>{_TITLE}</title>",
-        f"<style>{_STYLE}</style></head><body>", f"<h1>{_TITLE}</h1>", f"<p>{_LEAD}</p>",
+        f"<style>{_STYLE}</style></head><body>", f"<h1>{_TITLE}</h1>", f"<p>{_lead(sections)}</p>",
     ]  # fmt: skip
     for section in sections:
         parts.append(f"<h2>{html.escape(section.title)}</h2>")
@@ -163,7 +169,7 @@ def text(sections: Sequence[Section], videos: Sequence[Path], root: Path, out: P
     def link(path: Path) -> str:
         return Path(os.path.relpath(path, out.parent)).as_posix()
 
-    parts = [f"# {_TITLE}", _LEAD]
+    parts = [f"# {_TITLE}", _lead(sections)]
     for section in sections:
         parts.append(f"## {section.title}")
         if section.source is None:
