@@ -59,14 +59,15 @@ def measure(trainer: Trainer, targets: int, seed: int) -> dict[str, Any]:
     Raises:
       UserError: fewer windows than targets.
     """
+    count = trainer.config.transitions_per_iteration
+    if count < targets:
+        raise UserError(f"the first rollout has {count} windows: expected at least {targets}, one a target")
     state = trainer.init(seed)
     _, rollout_key, prior_key, _ = jax.random.split(state.key, 4)
     env, steps = trainer.env, trainer.config.ppo.rollout_steps
     _, record = jax.jit(lambda s, k: env.rollout(s.env, trainer.ppo.act(s.ppo), k, steps))(state, rollout_key)
     windows = trainer.feature_map(env.frame_table(state.env, record)[record.window])
     valid = np.flatnonzero(~np.asarray(record.nonfinite))
-    if len(valid) < targets:
-        raise UserError(f"the first rollout has {len(valid)} windows: expected at least {targets}, one a target")
     prior, reward, _ = jax.jit(trainer.prior.update)(state.prior, priors.Rollout(windows, ~record.nonfinite), prior_key)
     chosen = np.random.default_rng(seed).choice(valid, targets, replace=False)
     x = np.asarray(windows, np.float64).reshape(-1, windows.shape[-1])[chosen]
