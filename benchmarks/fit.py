@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from fmpjax import config, motion, potential, priors, transport
+from fmpjax import config, motion, priors, transport
 from fmpjax.config import PriorConfig
+from fmpjax.experiments.offline import product_flops, product_rate
 from fmpjax.priors import flow
 from fmpjax.train import Trainer
 
@@ -31,21 +32,6 @@ def seconds(call: Callable[[], object]) -> float:
     began = time.perf_counter()
     jax.block_until_ready(call())
     return time.perf_counter() - began
-
-
-def product_flops(settings: PriorConfig, size: int) -> dict[str, float]:
-    """Floating-point operations of an update's matrix products, for windows of ``size`` coordinates."""
-    bank, query = settings.bank, settings.minibatch
-    points = query * (2 if settings.flow_weight else 1)
-    # A layer's product and its transpose for the gradient in x; then the adjoints of both: two each, but that the
-    # points themselves need none.
-    layers = [(size, settings.hidden[0], 5), (size, potential.HEADS, 4)]
-    layers += [(i, o, 6) for i, o in zip(settings.hidden, (*settings.hidden[1:], potential.HEADS), strict=True)]
-    return {
-        "costs": 2.0 * size * (bank * bank * 2 + query * bank * 2),
-        "teacher gradient": 2.0 * size * query * bank * 2,
-        "network": sum(2.0 * points * i * o * times for i, o, times in layers),
-    }
 
 
 def parts(settings: PriorConfig, dimension, source, query, expert, params) -> dict[str, Callable[[], object]]:
@@ -91,14 +77,6 @@ def parts(settings: PriorConfig, dimension, source, query, expert, params) -> di
     }
 
 
-def matmul_rate(rounds: int, points: int, size: int, width: int) -> Callable[[], float]:
-    """Measures the machine's rate (FLOP/s) for products of the network's first layer's shape."""
-    a, b = jnp.ones((points, size)), jnp.ones((size, width))
-    chain = jax.jit(lambda a, b: jax.lax.fori_loop(0, rounds, lambda _, a: (a @ b) @ b.T * 1e-6, a))
-    jax.block_until_ready(chain(a, b))
-    return lambda: 4.0 * rounds * points * size * width / seconds(lambda: chain(a, b))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--rounds", type=int, default=9)
@@ -129,7 +107,7 @@ def main() -> None:
     warm = many()
     expert = windows[warm[0].bank]
     pieces = parts(fitted, dimension, pool[: fitted.bank], pool[-fitted.minibatch :], expert, warm[0].params)
-    rate = matmul_rate(8, 2 * fitted.minibatch, size, fitted.hidden[0])
+    rate = product_rate(2 * fitted.minibatch, size, fitted.hidden[0])
     for call in (few, many, *pieces.values()):
         seconds(call)
     slopes, rates, taken = [], [], []

@@ -1,4 +1,4 @@
-"""The command line: ``fmpjax train``, ``evaluate``, ``render``, ``export``, ``config``, ``motion``."""
+"""The command line: ``fmpjax train``, ``evaluate``, ``render``, ``export``, ``report``, ``motion``, ``config``."""
 
 import contextlib
 import dataclasses
@@ -218,6 +218,23 @@ class Export:
 
 
 @dataclasses.dataclass(frozen=True)
+class Report:
+    """Gather what the experiments found on one page, ours beside the paper's."""
+
+    folder: tyro.conf.Positional[Path]
+    """Folder below which their results are."""
+    out: Path | None = None
+    """HTML page to write, FOLDER/report.html by default; the same in Markdown stands beside it."""
+
+    def __call__(self) -> None:
+        _runs()
+        from fmpjax.experiments import report
+
+        for path in report.write(self.folder, self.out or self.folder / "report.html"):
+            print(f"wrote {path}")
+
+
+@dataclasses.dataclass(frozen=True)
 class ShowConfig:
     """Print every setting of a preset."""
 
@@ -244,8 +261,8 @@ def _default_preset() -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: bad input is one sentence and exit code 2."""
-    commands = {"train": Train, "evaluate": Evaluate, "render": Render, "export": Export, "config": ShowConfig}
-    commands["motion"] = Motion
+    commands = {"train": Train, "evaluate": Evaluate, "render": Render, "export": Export}
+    commands |= {"report": Report, "motion": Motion, "config": ShowConfig}
     command = tyro.extras.subcommand_cli_from_dict(
         commands, prog="fmpjax", description="Flow-Matched Motion Priors in JAX.", args=arguments
     )

@@ -17,8 +17,8 @@ import tyro
 
 from fmpjax import features, priors
 from fmpjax.errors import UserError
+from fmpjax.experiments import histories
 from fmpjax.motion import MotionClip, resample
-from fmpjax.ppo import PPOState
 from fmpjax.train import Trainer
 
 
@@ -59,24 +59,6 @@ def _frames(trainer: Trainer, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         trainer.robot, jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32), "compact"
     )
     return np.asarray(observed.frame)
-
-
-def pool(
-    trainer: Trainer, policy: PPOState, key: jax.Array, steps: int = 256, last: int = 32
-) -> tuple[jax.Array, float]:
-    """Windows of a policy, episodes at full length.
-
-    Returns:
-      Features ``[last, N, D]`` of the last of ``steps`` control steps, and their mean forward speed, m/s.
-    """
-    env = trainer.env
-    state = env.reset(key)._replace(cap=jnp.float32(trainer.config.env.episode_steps))
-    play = jax.jit(lambda state, key: env.rollout(state, trainer.ppo.act(policy), key, last))
-    for chunk_key in jax.random.split(key, max(1, steps // last)):
-        before = state
-        state, record = play(state, chunk_key)
-    speed = float(record.frame[..., features.velocity_index(trainer.robot)].mean())
-    return trainer.feature_map(env.frame_table(before, record)[record.window]), speed
 
 
 def rank(trainer: Trainer, windows: jax.Array, key: jax.Array, updates: int = 512) -> dict[str, dict[str, float]]:
@@ -138,12 +120,12 @@ def main(run: Path, start: bool = False, last: bool = False, updates: int = 512,
     else:
         trainer, state = opened.policy(best=not last)
         policy = state.ppo
-    windows, speed = pool(trainer, policy, jax.random.PRNGKey(0), steps=32 if start else 256)
-    ranking = rank(trainer, windows, jax.random.PRNGKey(1), updates)
-    print(f"pool: {windows.shape[0] * windows.shape[1]} windows, mean forward speed {speed:.3f} m/s")
+    played = histories.pool(trainer, policy, jax.random.PRNGKey(0), steps=32 if start else 256)
+    ranking = rank(trainer, played.features, jax.random.PRNGKey(1), updates)
+    print(f"pool: {played.valid.size} windows, mean forward speed {played.speed:.3f} m/s")
     print(table(ranking))
     path = out or opened.folder / ("ranking-start.json" if start else "ranking.json")
-    runs.write(path, json.dumps({"pool_speed": speed, "updates": updates, "windows": ranking}, indent=1))
+    runs.write(path, json.dumps({"pool_speed": played.speed, "updates": updates, "windows": ranking}, indent=1))
     print(f"wrote {path}")
 
 

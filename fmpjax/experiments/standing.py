@@ -19,10 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from fmpjax import features, physics, potential, ppo, priors, runs, transport
+from fmpjax import features, physics, potential, ppo, priors, runs
 from fmpjax.config import Config, preset
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Evaluator
+from fmpjax.experiments import reference
 from fmpjax.priors.base import median_reward
 from fmpjax.robots import Robot
 from fmpjax.train import Trainer, TrainState
@@ -176,29 +177,6 @@ def _groups(robot: Robot) -> dict[str, int]:
     }  # fmt: skip
 
 
-class Reference(NamedTuple):
-    """Transport score averaged over independent source banks."""
-
-    score: jax.Array  # [q] centred
-    gradient: jax.Array  # [q, D]
-
-
-def reference(pool: jax.Array, expert: jax.Array, query: jax.Array, trainer: Trainer, key: jax.Array) -> Reference:
-    """Mean transport score of ``BANKS`` source banks of ``pool [n, D]`` at ``query [q, D]``."""
-    config, dimension = trainer.config.prior, trainer.feature_map.dimension
-
-    def one(key):
-        source = pool[jax.random.randint(key, (config.bank,), 0, len(pool))]
-        cross = transport.squared_cost(source, expert)
-        epsilon = transport.entropy_coefficient(cross, dimension, config.epsilon_fraction)
-        fitted = transport.fit_score(source, expert, epsilon=epsilon, threshold=1e-4, max_iterations=1000)
-        score = fitted.score(query)
-        return score - score.mean(), fitted.gradient(query)
-
-    score, gradient = jax.lax.map(one, jax.random.split(key, BANKS))
-    return Reference(score.mean(0), gradient.mean(0))
-
-
 def deviations(trainer: Trainer) -> jax.Array:
     """The demonstration's own deviations ``[H, F]``, before any floor."""
     return features.relative_windows(trainer.env.clip_windows()).std(0)
@@ -210,9 +188,10 @@ def fits(trainer: Trainer, state: TrainState, moments: Moments, key: jax.Array) 
     pool = moments.windows.reshape(-1, moments.windows.shape[-1])
     pick_key, bank_key, fit_key = jax.random.split(key, 3)
     query = pool[jax.random.randint(pick_key, (QUERIES,), 0, len(pool))]
-    truth = reference(pool, trainer.expert.windows[state.prior.bank], query, trainer, bank_key)
-    low, high = jnp.quantile(truth.score, jnp.array([0.25, 0.75]))
-    spread = jnp.maximum(high - low, config.spread_floor)
+    truth = reference.reference(
+        pool, trainer.expert.windows[state.prior.bank], query, dimension, config, bank_key, BANKS
+    )
+    spread = jnp.maximum(reference.spread(truth.score), config.spread_floor)
     longer = dataclasses.replace(trainer.config, prior=dataclasses.replace(config, updates=128))
     longer = priors.make(trainer.config.method, trainer.expert, longer)
     rollout = priors.Rollout(moments.windows, jnp.ones(moments.speed.shape, bool))
@@ -220,15 +199,11 @@ def fits(trainer: Trainer, state: TrainState, moments: Moments, key: jax.Array) 
     row = {"score_spread": spread}
     for name, prior in (("online", state.prior), ("128_updates", refitted)):
         score, gradient = potential.score_and_gradient(prior.average, query, dimension)
-        score = score - score.mean()
-        cosine = jnp.sum(gradient * truth.gradient, -1) / jnp.maximum(
-            jnp.linalg.norm(gradient, axis=-1) * jnp.linalg.norm(truth.gradient, axis=-1), 1e-12
-        )
-        row[f"{name}_correlation"] = jnp.corrcoef(score, truth.score)[0, 1]
-        row[f"{name}_error"] = jnp.abs(score - truth.score).mean() / spread
-        row[f"{name}_gradient_cosine"] = cosine.mean()
+        row[f"{name}_correlation"] = reference.correlation(score, truth.score)
+        row[f"{name}_error"] = jnp.abs(score - score.mean() - truth.score).mean() / spread
+        row[f"{name}_gradient_cosine"] = reference.cosine(gradient, truth.gradient)
     score = trainer.prior.score(state.prior, pool)
-    spread = jnp.subtract(*jnp.quantile(score, jnp.array([0.75, 0.25])))
+    spread = reference.spread(score)
     gain = trainer.prior.score(state.prior, moments.pushed.reshape(pool.shape)) - score
     standing = jnp.abs(moments.speed.ravel()) < STANDING
     # What the reward's argument gains, in its own units, if a window, or a standing one, were PUSH faster.

@@ -4,8 +4,9 @@ import csv
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from fmpjax.experiments.cells import Cell
+from fmpjax.experiments.results import Verdict
 from fmpjax.logs import MetricsLog
 
 TITLES = {
@@ -115,18 +117,19 @@ def _paper(reset: str, method: str) -> list[float]:
     return [length, 100.0 * falls / 1024, *rest]
 
 
-def _lines(final: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
+def lines(final: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
+    """Headings and lines of Table I, the paper's beside ours."""
     headings = ["reset", "method", "seeds", *(heading for _, heading, _ in FIGURES), "training, min"]
-    lines = []
+    body = []
     for (reset, method, variant), rows in _groups(final).items():
         ours = [_number(*_ordered(interval(r.figures[k] for r in rows), digits)) for k, _, digits in FIGURES]
         minutes = np.mean([r.seconds for r in rows]) / 60
         name = title(method, variant)
-        lines.append([reset, name, str(len(rows)), *ours, f"{minutes:.0f}"])
+        body.append([reset, name, str(len(rows)), *ours, f"{minutes:.0f}"])
         if not variant:
             theirs = [_number(v, d) for v, (_, _, d) in zip(_paper(reset, method), FIGURES, strict=True)]
-            lines.append([reset, f"{name}, the paper's", "1", *theirs, ""])
-    return headings, lines
+            body.append([reset, f"{name}, the paper's", "1", *theirs, ""])
+    return headings, body
 
 
 def _ordered(pair: tuple[float, float], digits: int) -> tuple[float, int, float]:
@@ -135,14 +138,14 @@ def _ordered(pair: tuple[float, float], digits: int) -> tuple[float, int, float]
 
 def markdown(final: Sequence[Row]) -> str:
     """Table I in Markdown."""
-    headings, lines = _lines(final)
+    headings, body = lines(final)
     rule = ["---", "---", *["---:"] * (len(headings) - 2)]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (headings, rule, *lines))
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (headings, rule, *body))
 
 
 def latex(final: Sequence[Row]) -> str:
     """Table I in LaTeX (booktabs)."""
-    headings, lines = _lines(final)
+    headings, rows = lines(final)
 
     def line(cells):
         escaped = (
@@ -150,7 +153,7 @@ def latex(final: Sequence[Row]) -> str:
         )
         return " & ".join(escaped) + r" \\"
 
-    body = [line(headings), r"\midrule", *map(line, lines)]
+    body = [line(headings), r"\midrule", *map(line, rows)]
     columns = "ll" + "r" * (len(headings) - 2)
     return "\n".join([rf"\begin{{tabular}}{{{columns}}}", r"\toprule", *body, r"\bottomrule", r"\end{tabular}"])
 
@@ -203,9 +206,66 @@ def write(cells: Sequence[Cell], folder: Path, provenance: dict[str, object]) ->
         writer = csv.DictWriter(file, flat[0])
         writer.writeheader()
         writer.writerows({k: "" if v != v else v for k, v in line.items()} for line in flat)
-    lines = [{k: None if v != v else v for k, v in line.items()} for line in flat]
-    (folder / "results.json").write_text(json.dumps({"provenance": provenance, "evaluations": lines}, indent=1) + "\n")
+    plain = [{k: None if v != v else v for k, v in line.items()} for line in flat]
+    (folder / "results.json").write_text(json.dumps({"provenance": provenance, "evaluations": plain}, indent=1) + "\n")
     (folder / "table.md").write_text(markdown(final) + "\n")
     (folder / "table.tex").write_text(latex(final) + "\n")
     curves(rows, [folder / "curves.png", folder / "curves.pdf"])
     return [folder / n for n in ("results.csv", "results.json", "table.md", "table.tex", "curves.png", "curves.pdf")]
+
+
+def final(evaluations: Iterable[Mapping[str, Any]]) -> list[Row]:
+    """The last evaluation of every cell, of the evaluations that `write` left in ``results.json``."""
+    named = [field.name for field in dataclasses.fields(Row) if field.name != "figures"]
+    last = {}
+    for line in evaluations:
+        figures = {k: math.nan if v is None else v for k, v in line.items() if k not in named}
+        last[line["cell"]] = Row(*(line[name] for name in named), figures)
+    return list(last.values())
+
+
+def verdicts(final: Sequence[Row]) -> list[Verdict]:
+    """The paper's claims on the matched comparison, by our figures; those of which a side is missing are left out."""
+    found = {}
+    for (reset, method, variant), rows in _groups(final).items():
+        keys = ("late_speed", "falls", "excursion", "demonstration_speed")
+        found |= {} if variant else {(reset, method): {k: interval(r.figures[k] for r in rows)[0] for k in keys}}
+    fmp, amp = found.get(("dataset", "fmp")), found.get(("dataset", "amp"))
+    result = []
+    if fmp:
+        result.append(
+            Verdict(
+                "FMP walks from demonstration resets",
+                f"{fmp['late_speed']:.3f} m/s of the demonstration's {fmp['demonstration_speed']:.3f}, "
+                f"{fmp['falls']:.1f} % of episodes fall",
+                fmp["late_speed"] > 0.5 * fmp["demonstration_speed"] and fmp["falls"] < 5.0,
+            )
+        )
+    if fmp and amp:
+        result.append(
+            Verdict(
+                "FMP walks faster than AMP from demonstration resets",
+                f"{fmp['late_speed']:.3f} m/s against {amp['late_speed']:.3f}",
+                fmp["late_speed"] > amp["late_speed"],
+            )
+        )
+    for reset in ("dataset", "fixed"):
+        if bary := found.get((reset, "barycentric")):
+            result.append(
+                Verdict(
+                    f"The barycentric reward leaves the robot standing, {reset} reset",
+                    f"{bary['late_speed']:.3f} m/s, {bary['excursion']:.3f} of the demonstration's excursion",
+                    abs(bary["late_speed"]) < 0.1 and bary["excursion"] < 0.3,
+                )
+            )
+    fmp, endpoint = found.get(("fixed", "fmp")), found.get(("fixed", "endpoint"))
+    if fmp and endpoint:
+        result.append(
+            Verdict(
+                "Path supervision makes for fewer falls and more speed from the default pose",
+                f"{fmp['falls']:.1f} % and {fmp['late_speed']:.3f} m/s against {endpoint['falls']:.1f} % and "
+                f"{endpoint['late_speed']:.3f} m/s (Endpoint)",
+                fmp["falls"] < endpoint["falls"] and fmp["late_speed"] > endpoint["late_speed"],
+            )
+        )
+    return result

@@ -72,12 +72,18 @@ def teach(
 
 
 class Flow(NamedTuple):
-    """Flow-matching samples of one update."""
+    """Supervision along the paths of one update."""
 
     point: jax.Array  # [q, D] x_tau
     tau: jax.Array  # [q]
-    head: jax.Array  # [q, 3] one-hot
+    head: jax.Array  # [q, 3] weights of the heads, one-hot
     velocity: jax.Array  # [q, D] z - x
+
+
+def pick(draw: jax.Array, probability: jax.Array, targets: jax.Array) -> jax.Array:
+    """Targets ``[q, D]`` by probabilities ``[q, m]`` over ``targets [m, D]`` and uniform numbers ``draw [q]``."""
+    index = (jnp.cumsum(probability, axis=-1) < draw[:, None]).sum(-1)
+    return targets[jnp.minimum(index, len(targets) - 1)]
 
 
 def sample_flow(key, query, teacher: Teacher, source, expert) -> Flow:
@@ -85,15 +91,24 @@ def sample_flow(key, query, teacher: Teacher, source, expert) -> Flow:
     head_key, atom_key, tau_key = jax.random.split(key, 3)
     head = jax.random.randint(head_key, query.shape[:1], 0, potential.HEADS)
     draw = jax.random.uniform(atom_key, query.shape[:1])
-
-    def atoms(probability, targets):
-        index = (jnp.cumsum(probability, axis=-1) < draw[:, None]).sum(-1)
-        return targets[jnp.minimum(index, len(targets) - 1)]
-
-    target = jnp.where((head == 0)[:, None], atoms(teacher.to_expert, expert), atoms(teacher.to_source, source))
+    cross, itself = pick(draw, teacher.to_expert, expert), pick(draw, teacher.to_source, source)
+    target = jnp.where((head == 0)[:, None], cross, itself)
     tau = jax.random.uniform(tau_key, query.shape[:1])
     velocity = target - query
     return Flow(query + tau[:, None] * velocity, tau, jax.nn.one_hot(head, potential.HEADS), velocity)
+
+
+def static_path(flow: Flow, source, expert, dimension: jax.Array, config: PriorConfig) -> Flow:
+    """Static supervision at the same points (eq. static): the score's gradient by a bank of its own, at time zero.
+
+    Args:
+      flow: whose points are asked.
+      source: ``[n, D]`` bank B', independent of the one that drew the points.
+      expert: ``[m, D]``.
+    """
+    contrast = jnp.broadcast_to(jnp.asarray(potential.SCORE_CONTRAST), flow.head.shape)
+    gradient = teach(source, expert, flow.point, dimension, config).gradient
+    return Flow(flow.point, jnp.zeros_like(flow.tau), contrast, gradient)
 
 
 def losses(params, query, teacher: Teacher, flow: Flow, dimension, config: PriorConfig):
@@ -140,7 +155,15 @@ def make_value(expert: Expert, config: Config) -> MotionPrior:
     return _make(expert, changed)
 
 
-def _make(expert: Expert, config: PriorConfig) -> MotionPrior:
+def make_static(expert: Expert, config: Config) -> MotionPrior:
+    """FMP with static in place of dynamic supervision on the same paths: a control to fit offline, not a method.
+
+    Everything random but the second bank is drawn as FMP draws it.
+    """
+    return _make(expert, config.prior, static=True)
+
+
+def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> MotionPrior:
     windows, dimension = expert.windows, expert.dimension
     optimizer = optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.adam(config.learning_rate))
     # Weight of the newest parameters such that an update's share halves after `average_half_life` updates.
@@ -166,6 +189,9 @@ def _make(expert: Expert, config: PriorConfig) -> MotionPrior:
             query = sharding.split(pool[pick // querying * count + pick % querying])
             teacher = teach(source, expert_bank, query, dimension, config)
         flow = sample_flow(flow_key, query, teacher, source, expert_bank)
+        if static:
+            second = pool[jax.random.randint(jax.random.fold_in(bank_key, 1), (config.bank,), 0, len(pool))]
+            flow = static_path(flow, second, expert_bank, dimension, config)
         (total, stats), gradients = jax.value_and_grad(losses, has_aux=True)(
             params, query, teacher, flow, dimension, config
         )

@@ -1,0 +1,109 @@
+"""What the reward-level experiments share on their way out: tables, verdicts, files, and the way in from the shell."""
+
+import csv
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import tyro
+
+from fmpjax.errors import UserError
+
+
+class Table(NamedTuple):
+    """A table for people: cells are texts, the first column names the line."""
+
+    caption: str
+    headings: Sequence[str]
+    lines: Sequence[Sequence[str]]
+
+
+class Verdict(NamedTuple):
+    """A result of the paper, what was found here, and whether it holds by these figures."""
+
+    claim: str
+    found: str
+    holds: bool
+
+    def __str__(self) -> str:
+        return f"{self.claim}: {'holds' if self.holds else 'does not hold'} here, {self.found}."
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A figure for people; a dash where there is none."""
+    return "–" if value is None or math.isnan(value) else f"{value:,.{digits}f}"
+
+
+def text(table: Table) -> str:
+    """The table in columns of a terminal."""
+    rows = [table.headings, *table.lines]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(table.headings))]
+    line = lambda row: "  ".join(  # noqa: E731
+        cell.ljust(width) if i == 0 else cell.rjust(width)
+        for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+    )
+    return "\n".join([table.caption, *("  " + line(row) for row in rows)])
+
+
+def markdown(table: Table) -> str:
+    """The table in Markdown, its caption above."""
+    rule = ["---", *["---:"] * (len(table.headings) - 1)]
+    lines = ("| " + " | ".join(cells) + " |" for cells in (table.headings, rule, *table.lines))
+    return "\n".join([f"*{table.caption}*", "", *lines])
+
+
+def check_folder(out: Path) -> None:
+    """Raise a `UserError` unless ``out`` is a folder that can be written, or can be made one."""
+    nearest = next(place for place in (out, *out.absolute().parents) if place.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+        raise UserError(f"--out {out} cannot be written: expected a folder, or a place where one can be made")
+
+
+def save(
+    out: Path, name: str, record: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], places: Iterable[Path | str]
+) -> list[Path]:
+    """Write ``NAME.json`` with provenance and ``NAME.csv`` into ``out``; the paths written.
+
+    Args:
+      record: what the JSON file holds; what is not a number there becomes null.
+      rows: lines of the CSV file, all with the same keys.
+      places: folders and files of this machine, of which only the names are kept.
+    """
+    from fmpjax import runs
+
+    out.mkdir(parents=True, exist_ok=True)
+    written = json.dumps(_finite({**record, "provenance": runs.provenance()}), indent=1)
+    for place in sorted(map(str, places), key=len, reverse=True):
+        written = written.replace(place, Path(place).name)
+    runs.write(out / f"{name}.json", written)
+    partial = out / f"{name}.csv.partial"
+    with partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+    partial.replace(out / f"{name}.csv")
+    return [out / f"{name}.json", out / f"{name}.csv"]
+
+
+def _finite(value: Any) -> Any:
+    """``value`` without NaN and infinity, which JSON does not have."""
+    if isinstance(value, Mapping):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def entry(main: Callable[..., None], arguments: Sequence[str] | None = None) -> None:
+    """An experiment's command line: bad input is one sentence and exit code 2."""
+    try:
+        tyro.cli(main, args=arguments)
+    except UserError as error:
+        print(f"fmpjax: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
