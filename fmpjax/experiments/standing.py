@@ -163,7 +163,7 @@ def gradients(trainer: Trainer, state: TrainState, moments: Moments) -> dict[str
     return {
         "gradient_agreement": agreement(learned),  # cosine of the gradients of two independent rollouts
         "gradient_survival_cosine": a @ b / jnp.maximum(jnp.linalg.norm(a) * jnp.linalg.norm(b), 1e-12),
-        "return_survival_share": jnp.corrcoef(G, L)[0, 1] ** 2,
+        "return_survival_share": reference.correlation(G, L) ** 2,  # none where nobody falls
         "critic_explained_variance": 1.0 - jnp.var(G - value.ravel()) / jnp.var(G),
     }
 
