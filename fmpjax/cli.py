@@ -189,6 +189,8 @@ class Render:
     """Length at most."""
     out: Path | None = None
     """File, RUN/policy.mp4 by default; .gif where no encoder is installed."""
+    alone: bool = False
+    """Leave the demonstration out, whose licence may not let a picture of it be passed on."""
 
     def __call__(self) -> None:
         runs = _runs()
@@ -198,7 +200,7 @@ class Render:
         trainer, state = run.policy()
         print("rolling out and rendering ...", flush=True)
         played = Evaluator(trainer, 8).play(state.ppo)
-        print(f"wrote {runs.video(run, trainer, played, seconds=self.seconds, path=self.out)}")
+        print(f"wrote {runs.video(run, trainer, played, seconds=self.seconds, path=self.out, alone=self.alone)}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -295,18 +295,19 @@ def export(run: Run, out: Path) -> list[Path]:
         raise UserError(f"folder {out} cannot be written: {error.strerror}") from None
 
 
-def video(run: Run, trainer: Trainer, played, *, seconds: float = 10.0, path: Path | None = None) -> Path:
-    """The policy beside the demonstration, as a video; the path written."""
+def video(
+    run: Run, trainer: Trainer, played, *, seconds: float = 10.0, path: Path | None = None, alone: bool = False
+) -> Path:
+    """The policy beside the demonstration, or alone, as a video; the path written."""
     rate = trainer.config.control_rate
     stride = 2  # 25 pictures a second
     episode = _longest(played)
     steps = slice(0, min(int(seconds * rate), int(played.length[episode])), stride)
-    frames = render.side_by_side(
-        trainer.robot,
-        played.qpos[steps, episode],
-        trainer.clip.qpos[::stride],
-        labels=("policy", "demonstration"),
-    )
+    shown = {"policy": played.qpos[steps, episode]}
+    if not alone:
+        shown["demonstration"] = trainer.clip.qpos[::stride]
+    panes = len(shown)
+    frames = render.grid(trainer.robot, list(shown.values()), list(shown), columns=panes, width=360 * panes, height=360)
     return render.write_video(path or run.folder / "policy.mp4", frames, fps=rate / stride)
 
 

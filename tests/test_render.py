@@ -75,8 +75,8 @@ def test_bad_input_is_named(robot, walk, arguments, message):
         render.render_frames(robot, **({"qpos": walk, "using": "skeleton"} | arguments))
 
 
-def test_side_by_side_holds_the_shorter_motion(robot, walk):
-    frames = render.side_by_side(robot, walk, walk[:1], ("a", "b"), width=130, height=72, using="skeleton")
+def test_grid_holds_the_shorter_motion(robot, walk):
+    frames = render.grid(robot, (walk, walk[:1]), ("a", "b"), columns=2, width=130, height=72, using="skeleton")
     assert frames.shape == (3, 72, 130, 3)
     right = frames[:, :, 66:]
     assert (right == right[:1]).all() and right.std() > 5

@@ -124,33 +124,6 @@ def render_frames(
     return frames
 
 
-def side_by_side(
-    robot: Robot,
-    left_qpos: np.ndarray,
-    right_qpos: np.ndarray,
-    labels: tuple[str, str] = ("policy", "demonstration"),
-    *,
-    width: int = 720,
-    height: int = 360,
-    using: str | None = None,
-) -> np.ndarray:
-    """Draw two motions beside each other, each with its label; the shorter one holds its last frame.
-
-    Args:
-      robot: the robot.
-      left_qpos: ``[T, 7 + J]``.
-      right_qpos: ``[U, 7 + J]``.
-      labels: of the left and of the right pane.
-      width: pixels, of both panes together.
-      height: pixels.
-      using: as in `render_frames`.
-
-    Returns:
-      ``uint8 [max(T, U), height, width, 3]``.
-    """
-    return grid(robot, (left_qpos, right_qpos), labels, columns=2, width=width, height=height, using=using)
-
-
 def grid(
     robot: Robot,
     motions: Sequence[np.ndarray],
