@@ -174,7 +174,7 @@ def train(*group: Run, resume: bool = False, minutes: float | None = None, devic
             left = (config.iterations - done) * took / config.chunk
             if minutes is not None:
                 left = min(left, minutes * 60 - (time.monotonic() - began))
-            means = {name: float(np.nanmean([row[name] for row in rows])) for name in metrics}
+            means = {name: _mean([row[name] for row in rows]) for name in metrics}
             progress.show(_line(transitions, config, rate, left, means), final=done >= config.iterations)
             for run, each in zip(group, states, strict=True):
                 _check_finite(run, each, config)
@@ -375,6 +375,12 @@ def _best(log: MetricsLog) -> tuple[float, int]:
     return max((float(row["eval/quality"]) for row in rows), default=-1.0), max(
         (int(row["iteration"]) for row in rows), default=0
     )
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Mean of those that are defined; NaN where none is."""
+    defined = [value for value in values if not np.isnan(value)]
+    return float(np.mean(defined)) if defined else float("nan")
 
 
 def _line(transitions: int, config: Config, rate: float, left: float, m: dict[str, float]) -> str:
