@@ -31,8 +31,9 @@ evaluate: run-is-named $(READY) ## evaluate a run: RUN=runs/walk
 render: run-is-named $(READY) ## render a run's policy as a video: RUN=runs/walk
 	$(BIN)/fmpjax render '$(RUN)' $(ARGS)
 
-test: $(READY) ## run every test
-	$(BIN)/python -m pytest $(ARGS)
+# A file of tests at a time to each of two processes: most of the time is XLA's compiling, which uses one core.
+test: $(READY) ## run every test, in WORKERS processes (2)
+	$(BIN)/python -m pytest -n $(or $(WORKERS),2) --dist loadfile $(ARGS)
 
 test-fast: $(READY) ## run the tests that take seconds
 	$(BIN)/python -m pytest -m 'not slow' $(ARGS)

@@ -29,15 +29,15 @@ class Train:
     robot: str | None = None
     """A robot under robots/, `unitree_g1` by default."""
     motion: str | None = None
-    """A bundled motion's name, `walk` by default, or a file."""
+    """A bundled motion's name, `walk` by default, or a file; several with weights as NAME[:WEIGHT],NAME[:WEIGHT]."""
     frames: str | None = None
-    """Source rows first:last of the motion, 0-based, both included."""
+    """Source rows first:last of the motion, 0-based, both included; of several motions with commas between them."""
     seed: int | None = None
     """Seed of everything that is random."""
     seeds: int | None = None
     """Train as many seeds at once, from --seed on, in one program: the runs RUN/seed0, RUN/seed1, and so on."""
     transitions: int | None = None
-    """Budget of environment steps."""
+    """Budget of environment steps; with --resume, a larger one than the run's lets it go on."""
     run: Path | None = None
     """Folder of the run, runs/METHOD-DATE-TIME by default."""
     minutes: float | None = None
@@ -114,9 +114,16 @@ class Train:
         if self.preset is not None and self.preset != saved["preset"]:
             raise UserError(f"run {self.run} has preset {saved['preset']!r}: it cannot go on as {self.preset!r}")
         asked = configuration.flatten(configuration.with_changes(group[0].config, changes))
+        longer = asked["transitions"] > saved["transitions"]
         for key in changes:
-            if asked[key] != saved[key]:
+            if asked[key] != saved[key] and not (key == "transitions" and longer):
                 raise UserError(f"run {self.run} has {key} {saved[key]!r}: it cannot go on with {asked[key]!r}")
+        from fmpjax import sharding
+
+        if longer and sharding.primary():
+            for run in group:
+                run.extend(asked["transitions"])
+        sharding.wait("extended")
         return group
 
     def _created(self):

@@ -139,7 +139,7 @@ class Config:
 
     method: str = "fmp"
     robot: str = "unitree_g1"
-    motion: str = "walk"  # a bundled motion's name or a file
+    motion: str = "walk"  # a bundled motion's name or a file; several as NAME[:WEIGHT],NAME[:WEIGHT]
     frames: str = ""  # source rows "first:last" of the motion, both included; empty for all
     preset: str = "paper"
     seed: int = 0

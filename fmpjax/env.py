@@ -16,7 +16,7 @@ import numpy as np
 from fmpjax import features, physics, sharding
 from fmpjax.config import Config
 from fmpjax.features import Observed
-from fmpjax.motion import MotionClip
+from fmpjax.motion import MotionClip, MotionLibrary
 from fmpjax.robots import Robot
 
 # Faster than any joint or fall of a robot of this size, rad/s or m/s: such a state has blown up.
@@ -79,13 +79,13 @@ class ActionMap(NamedTuple):
         return jnp.clip(self.center + self.scale * action, self.low, self.high).astype(action.dtype)
 
 
-def action_map(robot: Robot, clip: MotionClip, kind: str) -> ActionMap:
-    """The ``absolute`` map around zero, or the ``residual`` map around the demonstration's mean pose."""
+def action_map(robot: Robot, library: MotionLibrary, kind: str) -> ActionMap:
+    """The ``absolute`` map around zero, or the ``residual`` map around the demonstrations' mean pose."""
     if kind == "absolute":
         scale = 1.4 * np.maximum(np.abs(robot.joint_low), np.abs(robot.joint_high))
         return ActionMap(np.zeros_like(scale), scale, -scale, scale)
     return ActionMap(
-        center=clip.qpos[:, 7:].mean(0),
+        center=library.mean([clip.qpos[:, 7:].mean(0) for clip in library.clips]),
         scale=0.25 * robot.effort / robot.stiffness,
         low=robot.joint_low - 0.3,
         high=robot.joint_high + 0.3,
@@ -93,19 +93,20 @@ def action_map(robot: Robot, clip: MotionClip, kind: str) -> ActionMap:
 
 
 class Env:
-    """Environments of one robot and demonstration; its methods are pure."""
+    """Environments of one robot and its demonstrations; its methods are pure."""
 
-    def __init__(self, robot: Robot, clip: MotionClip, config: Config, backend: physics.Physics):
+    def __init__(self, robot: Robot, motion: MotionClip | MotionLibrary, config: Config, backend: physics.Physics):
         self.robot, self.config, self.physics = robot, config.env, backend
         self.horizon = config.features.history
-        self.actions = action_map(robot, clip, config.env.action)
+        self.library = library = MotionLibrary.of(motion)
+        self.actions = action_map(robot, library, config.env.action)
         observe = jax.jit(lambda qpos, qvel: features.observe(robot, qpos, qvel, config.env.observation))
         self._observe = observe
-        # Rows 0..M-1 are the demonstration, row M the default pose; resets gather from here.
-        self._qpos = np.concatenate([clip.qpos, robot.default_qpos[None]]).astype(np.float32)
-        self._qvel = np.concatenate([clip.qvel, np.zeros_like(clip.qvel[:1])]).astype(np.float32)
+        # Rows 0..M-1 are the demonstrations, row M the default pose; resets gather from here.
+        self._qpos = np.concatenate([library.qpos, robot.default_qpos[None]]).astype(np.float32)
+        self._qvel = np.concatenate([library.qvel, np.zeros_like(library.qvel[:1])]).astype(np.float32)
         self._table = jax.tree.map(np.asarray, observe(jnp.asarray(self._qpos), jnp.asarray(self._qvel)))
-        self.clip_length = len(clip.qpos)
+        self.clip_rows = len(library.qpos)
 
     @property
     def observation_size(self) -> int:
@@ -113,24 +114,28 @@ class Env:
 
     @property
     def clip_observations(self) -> np.ndarray:
-        """Policy observations of the demonstration, ``[M, O]``."""
+        """Policy observations of the demonstrations, ``[M, O]``."""
         return self._table.actor[:-1]
 
     def clip_windows(self) -> jax.Array:
-        """The demonstration's windows of compact frames, ``[M - H + 1, H, F]``."""
-        starts = np.arange(self.clip_length - self.horizon + 1)
+        """The demonstrations' windows of compact frames, ``[W, H, F]``."""
+        starts = self.library.window_starts(self.horizon)
         return jnp.asarray(self._table.frame)[starts[:, None] + np.arange(self.horizon)]
 
     def reset_rows(self, key: jax.Array, count: int) -> jax.Array:
         """Table rows ``[count]`` at which episodes start under the configured regime."""
         if self.config.reset == "fixed":
-            return jnp.full((count,), self.clip_length)
-        return jax.random.randint(key, (count,), self.horizon - 1, self.clip_length)
+            return jnp.full((count,), self.clip_rows)
+        starts, lengths = self.library.starts, self.library.lengths
+        weights = jnp.asarray(self.library.weights)
+        clip = jax.random.choice(jax.random.fold_in(key, 1), len(starts), (count,), p=weights)
+        first, end = jnp.asarray(starts + self.horizon - 1), jnp.asarray(starts + lengths)
+        return jax.random.randint(key, (count,), first[clip], end[clip])
 
     def history_rows(self, rows: jax.Array) -> jax.Array:
         """Table rows ``[count, H]`` of the histories that end at ``rows``."""
         before = rows[:, None] - np.arange(self.horizon)[::-1]
-        return jnp.where(rows[:, None] == self.clip_length, rows[:, None], before)
+        return jnp.where(rows[:, None] == self.clip_rows, rows[:, None], before)
 
     def start_at(self, rows: jax.Array) -> EnvState:
         """Environments at the table rows ``[N]``, episodes beginning."""
@@ -158,7 +163,7 @@ class Env:
         count = len(state.age)
         table = jax.tree.map(jnp.asarray, self._table)
         qpos, qvel = jnp.asarray(self._qpos), jnp.asarray(self._qvel)
-        before = self.clip_length + 1  # rows ahead of the frames before the rollout
+        before = self.clip_rows + 1  # rows ahead of the frames before the rollout
         during = before + count * self.horizon  # rows ahead of the rollout's own frames
 
         def step(carry, inputs):

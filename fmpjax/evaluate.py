@@ -12,6 +12,7 @@ from ott.geometry import geometry
 from ott.tools import sinkhorn_divergence
 
 from fmpjax import features, kinematics, metrics, rotations, transport
+from fmpjax.motion import MotionClip
 from fmpjax.ppo import PPOState
 from fmpjax.train import Trainer
 
@@ -29,6 +30,17 @@ class Episodes(NamedTuple):
     fell: np.ndarray  # [N] bool
     start_qpos: np.ndarray  # [N, 7 + J]
     history: np.ndarray  # [N, H, F] compact frames up to the start
+    clip: np.ndarray  # [N] index of the demonstration that it starts in, 0 for the default pose
+
+
+class Share(NamedTuple):
+    """The episodes that started in one of several demonstrations."""
+
+    motion: str
+    episodes: int
+    falls: int
+    late_speed: float  # m/s
+    demonstration_speed: float  # m/s
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +63,7 @@ class Evaluation:
     demonstration_speed: float  # m/s
     joint_ranges: tuple[float, ...]  # degrees, six sagittal joints
     expert_ranges: tuple[float, ...]  # degrees
+    motions: tuple[Share, ...] = ()  # where there are several
 
     @property
     def quality(self) -> float:
@@ -66,7 +79,8 @@ class Evaluation:
     def to_json(self) -> str:
         """All figures; what is not defined is null."""
         values = dataclasses.asdict(self) | {"quality": self.quality}
-        return json.dumps({k: None if isinstance(v, float) and np.isnan(v) else v for k, v in values.items()}, indent=1)
+        motions = [_defined(share._asdict()) for share in values.pop("motions")]
+        return json.dumps(_defined(values | ({"motions": motions} if motions else {})), indent=1)
 
 
 class Evaluator:
@@ -113,14 +127,16 @@ class Evaluator:
 
     def play(self, state: PPOState) -> Episodes:
         """First episodes under ``state``'s mean action."""
-        return Episodes(*map(np.asarray, self._play(state)))
+        library = self.trainer.library
+        clip = np.where(self.rows < len(library.qpos), library.clip_of(self.rows), 0)
+        return Episodes(*map(np.asarray, self._play(state)), clip)
 
     def __call__(self, state: PPOState) -> Evaluation:
         return self.measure(self.play(state))
 
     def measure(self, played: Episodes) -> Evaluation:
         """The figures of played episodes."""
-        trainer, robot, clip = self.trainer, self.trainer.robot, self.trainer.clip
+        trainer, robot, library = self.trainer, self.trainer.robot, self.trainer.library
         rate = trainer.config.control_rate
         heading = rotations.yaw(played.start_qpos[:, 3:7].astype(np.float64))
         root = played.qpos[..., :3].astype(np.float64)
@@ -131,11 +147,13 @@ class Evaluator:
         length = played.length[detail]
         joints = played.qpos[:, detail, 7:].astype(np.float64)
         ranges = metrics.window_ranges(joints, length, robot.sagittal_joints, rate=rate)
-        expert = metrics.expert_ranges(clip.qpos[:, 7:], robot.sagittal_joints, rate=rate)
+        expert = library.mean(
+            [metrics.expert_ranges(clip.qpos[:, 7:], robot.sagittal_joints, rate=rate) for clip in library.clips]
+        )
         excursion = metrics.summarise(metrics.excursion(ranges, expert))
         feet, contact = self._feet(jnp.asarray(played.qpos[:, detail]))
         late = metrics.summarise(speed)
-        planar = np.diff(clip.qpos[:, :2], axis=0)
+        own_speed = [planar_speed(clip) for clip in library.clips]
         return Evaluation(
             episodes=self.count,
             falls=int(played.fell.sum()),
@@ -150,10 +168,22 @@ class Evaluator:
             contact_foot_speed=metrics.summarise(metrics.contact_foot_speed(feet, contact, length, rate=rate)).mean,
             imbalance=metrics.summarise(metrics.left_right_imbalance(ranges)).mean,
             displacement=metrics.summarise(displacement).mean,
-            demonstration_speed=float(np.linalg.norm(planar, axis=-1).mean() * clip.rate),
+            demonstration_speed=float(library.mean(own_speed)),
             joint_ranges=tuple(np.degrees(_finite_mean(ranges)).round(2).tolist()),
             expert_ranges=tuple(np.degrees(expert).round(2).tolist()),
+            motions=self._shares(played, speed, own_speed),
         )
+
+    def _shares(self, played: Episodes, speed: np.ndarray, own_speed: list[float]) -> tuple[Share, ...]:
+        clips = self.trainer.library.clips
+        if len(clips) == 1 or self.trainer.config.env.reset == "fixed":
+            return ()
+        shares = []
+        for i, clip in enumerate(clips):
+            mine = played.clip == i
+            late = metrics.summarise(speed[mine]).mean
+            shares.append(Share(clip.name, int(mine.sum()), int(played.fell[mine].sum()), late, own_speed[i]))
+        return tuple(shares)
 
     def _feet(self, qpos: jax.Array) -> tuple[np.ndarray, np.ndarray]:
         """Foot positions ``[T, n, F, 3]`` (m, the mean of a foot's sole points) and contacts ``[T, n, F]``."""
@@ -178,7 +208,10 @@ class Evaluator:
         pick = np.random.default_rng(0).permutation(len(steps))[:WINDOWS]
         rows = steps[pick, None] + 1 + np.arange(horizon)
         evaluated = trainer.feature_map(jnp.asarray(frames[rows, episodes[pick, None]]))
-        expert = trainer.expert.windows[:: max(1, len(trainer.expert.windows) // WINDOWS)]
+        rows = np.arange(0, len(trainer.expert.windows), max(1, len(trainer.expert.windows) // WINDOWS))
+        if trainer.expert.share is not None:
+            rows = trainer.expert.bank_rows(jax.random.PRNGKey(0), WINDOWS)
+        expert = trainer.expert.windows[rows]
         return float(discrepancy(evaluated, expert, trainer.feature_map.dimension))
 
 
@@ -196,6 +229,16 @@ def discrepancy(x: jax.Array, y: jax.Array, dimension: jax.Array) -> jax.Array:
         solve_kwargs={"threshold": 1e-4, "max_iterations": 2000},
     )
     return value
+
+
+def planar_speed(clip: MotionClip) -> float:
+    """Mean speed of a clip's root over the floor, m/s."""
+    return float(np.linalg.norm(np.diff(clip.qpos[:, :2], axis=0), axis=-1).mean() * clip.rate)
+
+
+def _defined(values: dict) -> dict:
+    """Null in place of what is not defined, for JSON."""
+    return {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in values.items()}
 
 
 def _finite_mean(ranges: np.ndarray) -> np.ndarray:
@@ -221,5 +264,13 @@ def table(evaluation: Evaluation) -> str:
         ("forward displacement", f"{e.displacement:.2f}", "m"),
         ("leg ranges (hip, knee, ankle; L, R)", " ".join(f"{r:.0f}" for r in e.joint_ranges), "degrees"),
         ("expert's leg ranges", " ".join(f"{r:.0f}" for r in e.expert_ranges), "degrees"),
+    ]
+    rows += [
+        (
+            f"from {share.motion}",
+            f"{share.late_speed:.3f}",
+            f"m/s of {share.demonstration_speed:.3f}, {share.falls} falls in {share.episodes}",
+        )
+        for share in e.motions
     ]
     return "\n".join(f"  {name:<36} {value:>20}  {unit}".rstrip() for name, value, unit in rows)

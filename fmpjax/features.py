@@ -214,16 +214,20 @@ class FeatureMap(NamedTuple):
         return x.reshape(*x.shape[:-2], -1)
 
 
-def fit_feature_map(robot: Robot, windows: jax.Array, config: FeatureConfig) -> FeatureMap:
-    """Feature map from the demonstration's windows of compact frames ``[W, H, F]``."""
+def fit_feature_map(
+    robot: Robot, windows: jax.Array, config: FeatureConfig, share: np.ndarray | None = None
+) -> FeatureMap:
+    """Feature map from the demonstrations' windows of compact frames ``[W, H, F]``, weighed by ``share [W]``."""
     dimension = config.history * frame_size(robot)
     relative = np.asarray(relative_windows(windows), np.float64)
+    mean = relative.mean(0) if share is None else np.average(relative, axis=0, weights=share)
+    deviation = np.sqrt(np.average((relative - mean) ** 2, axis=0, weights=share))
     floor = np.full(relative.shape[-1], config.deviation_floor)
     # The last coordinates of a frame: the root's angular velocity, then the joints'.
     floor[-(3 + robot.joint_count) :] = config.angular_velocity_floor
     return FeatureMap(
-        mean=jnp.asarray(relative.mean(0), jnp.float32),
-        deviation=jnp.asarray(np.maximum(relative.std(0), floor), jnp.float32),
+        mean=jnp.asarray(mean, jnp.float32),
+        deviation=jnp.asarray(np.maximum(deviation, floor), jnp.float32),
         weight=jnp.asarray(compact_weights(robot) / np.sqrt(dimension), jnp.float32),
         clip=jnp.float32(config.clip),
         dimension=jnp.float32(dimension),

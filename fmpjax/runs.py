@@ -34,9 +34,9 @@ _PACKAGES = "jax jaxlib mujoco mujoco-mjx brax flax optax ott-jax orbax-checkpoi
 _SAVE_INTERVAL = 120.0  # s between checkpoints at most, but for the iterations in hand
 
 
-def load_motion(config: Config) -> motion.MotionClip:
-    """The demonstration that a configuration names, at its control rate."""
-    return motion.load(
+def load_motion(config: Config) -> motion.MotionLibrary:
+    """The demonstrations that a configuration names, at its control rate."""
+    return motion.load_library(
         config.motion, frames=config.frames or None, rate=round(config.control_rate, 6), robot=config.robot
     )
 
@@ -44,8 +44,9 @@ def load_motion(config: Config) -> motion.MotionClip:
 class Run:
     """A run folder.
 
-    ``config.json`` and ``provenance.json`` say what it is; ``demonstration.npz`` holds the clip as it was resampled;
-    ``metrics.csv`` and ``tensorboard/`` its course; ``checkpoints/`` and ``best/`` its state.
+    ``config.json`` and ``provenance.json`` say what it is; ``demonstration.npz`` holds the clip as it was resampled,
+    ``demonstration-2.npz`` and so on further ones; ``metrics.csv`` and ``tensorboard/`` its course; ``checkpoints/``
+    and ``best/`` its state.
     """
 
     def __init__(self, folder: str | Path):
@@ -61,12 +62,13 @@ class Run:
           UserError: the folder holds a run already, or cannot be written.
         """
         run = cls(folder)
-        clip = load_motion(config)
+        library = load_motion(config)
         if (run.folder / "config.json").exists():
             raise UserError(f"run folder {run.folder} holds a run already: go on with --resume, or name another --run")
         try:
             run.folder.mkdir(parents=True, exist_ok=True)
-            motion.save(clip, run.folder / "demonstration.npz")
+            for clip, path in zip(library.clips, run._demonstration_files(len(library.clips)), strict=True):
+                motion.save(clip, path)
             write(run.folder / "provenance.json", json.dumps(provenance(), indent=1))
             run._trainer = Trainer(config, run._demonstration(config))
             # Last: a folder with a configuration is a run, and what cannot be trained is none.
@@ -95,6 +97,12 @@ class Run:
         except (json.JSONDecodeError, UnicodeDecodeError, AttributeError):
             raise UserError(f"{path} is not valid JSON: expected a run's configuration") from None
 
+    def extend(self, transitions: int) -> None:
+        """Give the run a larger budget; its evaluations are at shares of that from here on."""
+        longer = dataclasses.replace(self.config, transitions=transitions)
+        write(self.folder / "config.json", configuration.to_json(longer))
+        self._trainer = None
+
     def trainer(self) -> Trainer:
         """The run's parts."""
         if self._trainer is None:
@@ -102,9 +110,18 @@ class Run:
             self._trainer = Trainer(config, self._demonstration(config))
         return self._trainer
 
-    def _demonstration(self, config: Config) -> motion.MotionClip:
-        """The clip as the folder holds it, whoever asks: the first process and a resumed one see the same bits."""
-        return motion.load(self.folder / "demonstration.npz", rate=round(config.control_rate, 6), robot=config.robot)
+    def _demonstration_files(self, count: int) -> list[Path]:
+        return [self.folder / f"demonstration{f'-{i + 1}' if i else ''}.npz" for i in range(count)]
+
+    def _demonstration(self, config: Config) -> motion.MotionLibrary:
+        """The clips as the folder holds them, whoever asks: the first process and a resumed one see the same bits."""
+        names = [Path(name).stem for name, _ in motion.library.parse(config.motion)]
+        clips = [
+            motion.load(path, rate=round(config.control_rate, 6), robot=config.robot)
+            for path in self._demonstration_files(len(names))
+        ]
+        named = (dataclasses.replace(clip, name=name) for clip, name in zip(clips, names, strict=True))
+        return motion.MotionLibrary(tuple(named), motion.library.shares(config.motion))
 
     def policy(self, *, best: bool = True) -> tuple[Trainer, TrainState]:
         """The run's parts and its best state, or its newest where no evaluation chose a best one."""
@@ -143,7 +160,7 @@ def train(*group: Run, resume: bool = False, minutes: float | None = None, devic
     evaluator = Evaluator(trainer)
     done = int(states[0].iteration)
     if done >= config.iterations:
-        progress.note(f"the budget of {config.transitions:,} transitions is spent already")
+        progress.note(f"the budget of {config.transitions:,} transitions is spent: a larger --transitions would go on")
         return End.BUDGET
     progress.note(f"{trainer.env.physics.name} physics on {_device_name()}; compiling, which takes a minute or so ...")
     compile_began = time.monotonic()
@@ -281,7 +298,7 @@ def export(run: Run, out: Path) -> list[Path]:
     """
     # Where the demonstration and the run lay is this machine's affair; their names are everybody's.
     texts = {n: (run.folder / n).read_text() for n in ("config.json", "provenance.json")}
-    for path in (run.config.motion, str(run.folder)):
+    for path in (*(name for name, _ in motion.library.parse(run.config.motion)), str(run.folder)):
         texts = {n: text.replace(path, Path(path).name) for n, text in texts.items()}
     if (out / "config.json").exists() and (out / "config.json").read_text() != texts["config.json"]:
         raise UserError(f"{out} holds results of another configuration: expected a new folder or this run's own")
@@ -305,7 +322,7 @@ def video(
     steps = slice(0, min(int(seconds * rate), int(played.length[episode])), stride)
     shown = {"policy": played.qpos[steps, episode]}
     if not alone:
-        shown["demonstration"] = trainer.clip.qpos[::stride]
+        shown["demonstration"] = trainer.library.clips[played.clip[episode]].qpos[::stride]
     panes = len(shown)
     frames = render.grid(trainer.robot, list(shown.values()), list(shown), columns=panes, width=360 * panes, height=360)
     return render.write_video(path or run.folder / "policy.mp4", frames, fps=rate / stride)

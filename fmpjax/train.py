@@ -15,7 +15,7 @@ from fmpjax import features, physics, priors, robots, sharding
 from fmpjax.config import Config
 from fmpjax.env import PER_ENVIRONMENT, Env, EnvState, Steps
 from fmpjax.errors import UserError
-from fmpjax.motion import MotionClip
+from fmpjax.motion import MotionClip, MotionLibrary
 from fmpjax.ppo import PPO, Batch, PPOState
 
 
@@ -36,33 +36,36 @@ Metrics = dict[str, jax.Array]
 class Trainer:
     """The parts of one run, and the pure functions that train them."""
 
-    def __init__(self, config: Config, clip: MotionClip):
+    def __init__(self, config: Config, demonstration: MotionClip | MotionLibrary):
         priors.check(config.method)
-        if abs(clip.rate - config.control_rate) > 1e-6:
-            raise UserError(
-                f"motion {clip.name} has {clip.rate:g} samples a second: expected the control rate, "
-                f"{config.control_rate:g} Hz"
-            )
-        if clip.robot != config.robot:
-            raise UserError(f"motion {clip.name} is of robot {clip.robot!r}: expected {config.robot!r}")
-        if len(clip) <= config.features.history:
-            raise UserError(
-                f"setting features.history is {config.features.history}: expected fewer than the {len(clip)} samples "
-                f"of motion {clip.name}"
-            )
-        self.config, self.clip = config, clip
+        self.config, self.library = config, MotionLibrary.of(demonstration)
+        for clip in self.library.clips:
+            _check(clip, config)
         self.robot = robots.load(config.robot)
-        self.env = Env(self.robot, clip, config, physics.make(self.robot, config.physics))
+        self.env = Env(self.robot, self.library, config, physics.make(self.robot, config.physics))
         self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo)
-        windows = self.env.clip_windows()
-        self.feature_map = features.fit_feature_map(self.robot, windows, config.features)
+        windows, share = self.env.clip_windows(), self.library.window_share(self.env.horizon)
+        self.feature_map = features.fit_feature_map(self.robot, windows, config.features, share)
         self.expert = priors.Expert(
             windows=self.feature_map(windows),
             dimension=float(self.feature_map.dimension),
             weight=jnp.tile(self.feature_map.weight, self.env.horizon),
             horizon=self.env.horizon,
+            share=None if share is None else jnp.asarray(share, jnp.float32),
         )
         self.prior = priors.make(config.method, self.expert, config)
+
+    @property
+    def clip(self) -> MotionClip:
+        """The only demonstration.
+
+        Raises:
+          UserError: there are several.
+        """
+        if len(self.library.clips) > 1:
+            names = ", ".join(clip.name for clip in self.library.clips)
+            raise UserError(f"the run has {len(self.library.clips)} motions ({names}): expected one")
+        return self.library.clips[0]
 
     def init(self, seed: int | None = None) -> TrainState:
         """The state at iteration zero, a function of the seed, by default the configuration's."""
@@ -136,6 +139,21 @@ class Trainer:
         split = {name: jax.device_put(getattr(state.env, name), sharding.rows(over)) for name in PER_ENVIRONMENT}
         state = jax.device_put(state, sharding.everywhere(over))
         return state._replace(env=state.env._replace(**split))
+
+
+def _check(clip: MotionClip, config: Config) -> None:
+    if abs(clip.rate - config.control_rate) > 1e-6:
+        raise UserError(
+            f"motion {clip.name} has {clip.rate:g} samples a second: expected the control rate, "
+            f"{config.control_rate:g} Hz"
+        )
+    if clip.robot != config.robot:
+        raise UserError(f"motion {clip.name} is of robot {clip.robot!r}: expected {config.robot!r}")
+    if len(clip) <= config.features.history:
+        raise UserError(
+            f"setting features.history is {config.features.history}: expected fewer than the {len(clip)} samples "
+            f"of motion {clip.name}"
+        )
 
 
 def stack(states: Sequence[TrainState]) -> TrainState:

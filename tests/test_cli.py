@@ -185,6 +185,7 @@ def test_unwritable_run_folder(refused, tmp_path):
         (["--seed", "7"], "seed 0: it cannot go on with 7"),
         (["--preset", "paper"], "preset 'smoke': it cannot go on as 'paper'"),
         (["--reset", "fixed"], "env.reset 'dataset': it cannot go on with 'fixed'"),
+        (["--transitions", "100"], "transitions 10240: it cannot go on with 100"),
         (["--set", "ppo.hidden=8,8"], "ppo.hidden (64, 64): it cannot go on with (8, 8)"),
         (["--set", "nope=1"], "unknown setting 'nope'"),
     ],

@@ -23,7 +23,7 @@ from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import preset
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Episodes, Evaluator
-from fmpjax.priors import bank_rows
+from fmpjax.priors import Expert
 from fmpjax.train import Trainer
 
 # Eight environments, eight steps, five chunks of two iterations: a second of training after the compilation.
@@ -211,6 +211,18 @@ def test_a_resume_in_a_new_process_is_exact(trained, stopped):
 
 
 @pytest.mark.slow
+def test_a_larger_budget_goes_on_as_if_it_had_been_the_first(trained, tmp_path):
+    run = runs.Run.create(tmp_path / "run", tiny(transitions=TINY["transitions"] // 5))
+    assert runs.train(run) is runs.End.BUDGET
+    run.extend(TINY["transitions"])
+    assert run.config == tiny()
+    assert runs.train(run, resume=True) is runs.End.BUDGET
+    whole, halves = leaves(trained), leaves(run.folder)
+    for name, leaf in whole.items():
+        np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
+
+
+@pytest.mark.slow
 def test_sigterm_saves_and_ends_well(tmp_path):
     folder = tmp_path / "run"
     # Twenty thousand iterations: it cannot end before the signal.
@@ -302,8 +314,9 @@ def test_no_checkpoint_is_said(tmp_path):
 
 @pytest.mark.parametrize(("windows", "size"), [(370, 256), (342, 256), (256, 256), (40, 256), (1000, 7), (1, 5)])
 def test_expert_bank_is_even_and_in_range(windows, size):
+    expert = Expert(jnp.zeros((windows, 1)), 1.0, jnp.ones(1), 1)
     for seed in range(20):
-        picked = np.asarray(bank_rows(jax.random.PRNGKey(seed), windows, size))
+        picked = np.asarray(expert.bank_rows(jax.random.PRNGKey(seed), size))
         assert picked.shape == (size,) and picked.min() >= 0 and picked.max() < windows
         # Every gap, that around the end included, is the mean one rounded down or up; so are the repetitions.
         gaps = np.diff(np.append(picked, picked[0] + windows))
@@ -394,6 +407,7 @@ def test_the_demonstration_itself_scores_perfectly(trainer, fallen):
         fell=np.zeros(4, bool),
         start_qpos=clip.qpos[starts].astype(np.float32),
         history=np.stack([table[s - horizon + 1 : s + 1] for s in starts]),
+        clip=np.zeros(4, int),
     )
     result = evaluator.measure(played)
     assert result.falls == 0 and result.mean_length == steps

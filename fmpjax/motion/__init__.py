@@ -2,5 +2,6 @@
 
 from fmpjax.motion.clip import MotionClip, resample, velocities
 from fmpjax.motion.formats import bundled, load, save
+from fmpjax.motion.library import MotionLibrary, load_library
 
-__all__ = ["MotionClip", "bundled", "load", "resample", "save", "velocities"]
+__all__ = ["MotionClip", "MotionLibrary", "bundled", "load", "load_library", "resample", "save", "velocities"]

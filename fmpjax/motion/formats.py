@@ -72,7 +72,7 @@ def record(
     _check_rate("fps", fps)
     span = _parse_frames(frames)
     loaded = robots.load(robot)
-    file = _locate(path)
+    file = locate(path)
     qpos, rate = readers.read(file, loaded)
     if span is not None:
         first, last = span
@@ -108,7 +108,7 @@ def save(clip: MotionClip, path: str | os.PathLike) -> Path:
     return path
 
 
-def _locate(path: str | os.PathLike) -> Path:
+def locate(path: str | os.PathLike) -> Path:
     """The file that ``path`` names: a bundled motion's or its own."""
     file = Path(path)
     if file.name == str(path) and file.name in bundled():

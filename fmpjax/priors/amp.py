@@ -160,7 +160,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         reward = reward_of(logits, settings).reshape(rollout.valid.shape)
         reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
 
-        seen = expert.windows[jax.random.randint(expert_key, (len(pool),), 0, len(expert.windows))]
+        seen = expert.draw(expert_key, (len(pool),))
         normalizer = update_normalizer(state.normalizer, pool / expert.weight, seen / expert.weight)
 
         def step(carry, inputs):
@@ -173,7 +173,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
             # The first rollout has nothing behind it: it is its own past.
             old = jnp.where(held > 0, old.astype(pool.dtype), current)
             agent = normalize(normalizer, jnp.concatenate([current, old]))
-            demonstration = expert.windows[jax.random.randint(expert_key, rows.shape, 0, len(expert.windows))]
+            demonstration = expert.draw(expert_key, rows.shape)
             (total, stats), gradients = jax.value_and_grad(
                 lambda p: loss(network.apply, p, agent, normalize(normalizer, demonstration), settings), has_aux=True
             )(params)

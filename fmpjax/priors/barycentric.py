@@ -12,7 +12,7 @@ import numpy as np
 
 from fmpjax import sharding, transport
 from fmpjax.config import Config, PriorConfig
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, bank_rows, flatten
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten
 
 
 class BarycentricState(NamedTuple):
@@ -64,7 +64,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
     scale = expert.dimension / (per_frame * settings.temperature)
 
     def init(key):
-        rows = bank_rows(key, len(expert.windows), settings.bank)
+        rows = expert.bank_rows(key, settings.bank)
         condition, successor = split(expert.windows[rows], expert.horizon)
         return BarycentricState(condition, successor, jnp.zeros(len(condition)), jnp.float32(1.0))
 
@@ -78,8 +78,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         pool = flatten(rollout, expert.windows[0])
         source_key, expert_key = jax.random.split(key)
         source = sharding.split(pool[jax.random.randint(source_key, (settings.bank,), 0, len(pool))])
-        rows = jax.random.randint(expert_key, (settings.bank,), 0, len(expert.windows))
-        condition, successor = split(expert.windows[rows], expert.horizon)
+        condition, successor = split(expert.draw(expert_key, (settings.bank,)), expert.horizon)
         dual, epsilon, solution = match(split(source, expert.horizon)[0], condition, expert, settings)
         state = BarycentricState(condition, successor, dual, epsilon)
         scores = score(state, pool)

@@ -20,12 +20,30 @@ class Rollout(NamedTuple):
 
 
 class Expert(NamedTuple):
-    """The demonstration as a prior sees it, in the fixed features."""
+    """The demonstrations as a prior sees them, in the fixed features."""
 
     windows: jax.Array  # [W, D] every window
     dimension: float  # d, coordinates of the full features that the D stand for
     weight: jax.Array  # [D] feature of a standardised coordinate: root of its multiplicity over sqrt(d)
     horizon: int  # frames in a window, oldest first, D / horizon coordinates each
+    share: jax.Array | None = None  # [W] how often each window is drawn, summing to one; evenly where None
+
+    def bank_rows(self, key: jax.Array, size: int) -> jax.Array:
+        """Windows ``[size]`` of an expert bank: spread evenly over the demonstrations, repeated where they are shorter.
+
+        An even spread is a stratified draw: it has the uniform draw's mean and less variance.
+        """
+        offset, count = jax.random.uniform(key), len(self.windows)
+        if self.share is None:
+            return jnp.floor((jnp.arange(size) + offset) * count / size).astype(jnp.int32)
+        rows = jnp.searchsorted(jnp.cumsum(self.share), (jnp.arange(size) + offset) / size, side="right")
+        return jnp.minimum(rows, count - 1).astype(jnp.int32)
+
+    def draw(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+        """Windows ``[*shape, D]``, drawn with replacement."""
+        if self.share is None:
+            return self.windows[jax.random.randint(key, shape, 0, len(self.windows))]
+        return self.windows[jax.random.choice(key, len(self.windows), shape, p=self.share)]
 
 
 class MotionPrior(NamedTuple):
@@ -44,15 +62,6 @@ def flatten(rollout: Rollout, stand_in: jax.Array) -> jax.Array:
     """All windows of a rollout, ``[T * N, D]``; ``stand_in [D]`` takes the place of those that are not finite."""
     features = jnp.where(rollout.valid[..., None], rollout.features, stand_in)
     return sharding.split(features.reshape(-1, features.shape[-1]))
-
-
-def bank_rows(key: jax.Array, windows: int, size: int) -> jax.Array:
-    """Windows ``[size]`` of an expert bank: spread evenly over the demonstration, repeated where it is shorter.
-
-    An even spread is a stratified draw: it has the uniform draw's mean and less variance.
-    """
-    offset = jax.random.uniform(key)
-    return jnp.floor((jnp.arange(size) + offset) * windows / size).astype(jnp.int32)
 
 
 class Reward(NamedTuple):

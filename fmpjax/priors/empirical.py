@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from fmpjax import sharding, transport
 from fmpjax.config import Config
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, bank_rows, flatten, median_reward
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten, median_reward
 
 
 class EmpiricalState(NamedTuple):
@@ -42,7 +42,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         count, size = settings.score_banks, settings.bank
         source = jnp.broadcast_to(windows[0], (count, size, windows.shape[-1]))
         zeros = jnp.zeros((count, size))
-        return EmpiricalState(bank_rows(key, len(windows), size), source, zeros, zeros, jnp.ones(count))
+        return EmpiricalState(expert.bank_rows(key, size), source, zeros, zeros, jnp.ones(count))
 
     def score(state: EmpiricalState, x):
         to_expert = transport.squared_cost(x, windows[state.bank])  # in every source bank's score

@@ -14,7 +14,7 @@ import optax
 
 from fmpjax import potential, sharding, transport
 from fmpjax.config import Config, PriorConfig
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, bank_rows, flatten, median_reward
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten, median_reward
 
 
 class FlowState(NamedTuple):
@@ -172,7 +172,7 @@ def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> Motio
     def init(key):
         bank_key, key = jax.random.split(key)
         params = potential.init(key, windows.shape[-1], dimension, config.hidden)
-        return FlowState(bank_rows(bank_key, len(windows), config.bank), params, optimizer.init(params), params)
+        return FlowState(expert.bank_rows(bank_key, config.bank), params, optimizer.init(params), params)
 
     def score(state: FlowState, x):
         return potential.score(state.average, x, dimension)

@@ -1,0 +1,127 @@
+"""Several demonstrations as one: which there are, and how often each is drawn."""
+
+import dataclasses
+import math
+import os
+from functools import cached_property
+
+import numpy as np
+
+from fmpjax.errors import UserError
+from fmpjax.motion.clip import MotionClip
+from fmpjax.motion.formats import load
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MotionLibrary:
+    """``K`` clips of one robot at one rate; their rows follow one another in `qpos` and `qvel`.
+
+    A clip's weight is its share of the episodes that start in it and of the windows that the motion prior draws,
+    however long it is; within a clip all rows and windows weigh the same.
+    """
+
+    clips: tuple[MotionClip, ...]
+    weights: tuple[float, ...]  # sum to one
+
+    @classmethod
+    def of(cls, motion: "MotionClip | MotionLibrary") -> "MotionLibrary":
+        """A clip as the library of it alone."""
+        return motion if isinstance(motion, MotionLibrary) else cls((motion,), (1.0,))
+
+    @cached_property
+    def qpos(self) -> np.ndarray:
+        """Configurations of all clips, ``[M, 7 + J]``."""
+        return np.concatenate([clip.qpos for clip in self.clips])
+
+    @cached_property
+    def qvel(self) -> np.ndarray:
+        """Velocities of all clips, ``[M, 6 + J]``."""
+        return np.concatenate([clip.qvel for clip in self.clips])
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Rows of each clip, ``[K]``."""
+        return np.array([len(clip) for clip in self.clips])
+
+    @property
+    def starts(self) -> np.ndarray:
+        """First row of each clip, ``[K]``."""
+        return np.cumsum(self.lengths) - self.lengths
+
+    def window_starts(self, horizon: int) -> np.ndarray:
+        """First rows of the windows of ``horizon`` rows that lie within a clip, ``[W]``."""
+        return np.concatenate(
+            [start + np.arange(n - horizon + 1) for start, n in zip(self.starts, self.lengths, strict=True)]
+        )
+
+    def window_share(self, horizon: int) -> np.ndarray | None:
+        """How often each of those windows is drawn, ``[W]``, summing to one; None for one clip, where all are alike."""
+        if len(self.clips) == 1:
+            return None
+        windows = self.lengths - horizon + 1
+        return np.repeat(np.array(self.weights) / windows, windows)
+
+    def clip_of(self, rows: np.ndarray) -> np.ndarray:
+        """Index of the clip of each row; that of the last clip for rows past the end."""
+        return np.searchsorted(self.starts, rows, side="right") - 1
+
+    def mean(self, values) -> np.ndarray:
+        """Mean of one value a clip, by weight."""
+        return np.average(np.asarray(values), axis=0, weights=self.weights)
+
+
+def load_library(
+    names: str, *, frames: str | None = None, rate: float = 50.0, robot: str = "unitree_g1"
+) -> MotionLibrary:
+    """The clips that a list such as ``"walk,turn_left:0.5,mine.npz:2"`` names, each with its weight (1 by default).
+
+    Args:
+      names: motions as `fmpjax.motion.load` takes them, with commas between them.
+      frames: source rows "first:last" of the only clip, or of each, with commas between them.
+      rate: rate of the clips, Hz.
+      robot: name of the robot that they must be for.
+
+    Raises:
+      UserError: a motion, a weight or the rows are bad.
+    """
+    entries = parse(names)
+    spans = frames.split(",") if frames else [None] * len(entries)
+    if len(spans) != len(entries):
+        raise UserError(
+            f"frames is {frames!r}: expected FIRST:LAST for each of the {len(entries)} motions of {names!r}"
+        )
+    clips = tuple(
+        load(name, frames=span or None, rate=rate, robot=robot) for (name, _), span in zip(entries, spans, strict=True)
+    )
+    return MotionLibrary(clips, shares(names))
+
+
+def parse(names: str) -> list[tuple[str, float]]:
+    """Names and weights of a list of motions.
+
+    Raises:
+      UserError: a name is missing, or a weight is no positive number.
+    """
+    if os.path.isfile(names):  # whatever its name has in it
+        return [(names, 1.0)]
+    entries = []
+    for entry in names.split(","):
+        name, colon, text = entry.strip().rpartition(":")
+        if not colon or os.path.isfile(entry.strip()):
+            name, text = entry.strip(), "1"
+        try:
+            weight = float(text)
+        except ValueError:
+            weight = math.nan
+        if not (weight > 0 and math.isfinite(weight)):
+            raise UserError(f"motion {entry.strip()!r} has weight {text!r}: expected NAME:WEIGHT, a number above 0")
+        if not name:
+            raise UserError(f"motion {names!r} names nothing before or after a comma: expected NAME[:WEIGHT],...")
+        entries.append((name, weight))
+    return entries
+
+
+def shares(names: str) -> tuple[float, ...]:
+    """Weights of a list of motions, summing to one."""
+    weights = [weight for _, weight in parse(names)]
+    return tuple(weight / sum(weights) for weight in weights)
