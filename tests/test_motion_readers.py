@@ -168,6 +168,31 @@ def test_cut_short_and_damaged(tmp_path, qpos, make):
             assert np.isfinite(loaded.qpos).all()
 
 
+def test_damaged_text(tmp_path, qpos):
+    """A CSV with bytes changed, lines cut, doubled or swapped loads as finite numbers or is one sentence."""
+    path, rng = tmp_path / "a.csv", np.random.default_rng(5)
+    rows = np.concatenate([qpos[:, :3], qpos[:, [4, 5, 6, 3]], qpos[:, 7:]], axis=1)
+    whole = "\n".join(",".join(f"{v:.6f}" for v in row) for row in rows).encode()
+    refused = 0
+    for round_ in range(200):
+        damaged = bytearray(whole)
+        if round_ % 2:
+            start, end = np.sort(rng.integers(0, len(whole), 2))
+            piece = damaged[start:end]
+            damaged[start:end] = (b"", piece * 2, piece[::-1])[round_ % 3]
+        for at in rng.integers(0, len(damaged), 1 + round_ % 5) if damaged else ():
+            damaged[at] = rng.choice(list(b",-.e9n\n\r\x00 \xff\xe9"))
+        path.write_bytes(damaged)
+        try:
+            loaded = motion.load(path)
+        except UserError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+            refused += 1
+        else:
+            assert np.isfinite(loaded.qpos).all()
+    assert 100 < refused < 200
+
+
 @pytest.mark.parametrize("make", PICKLES + ARCHIVES)
 def test_wrong_values(tmp_path, qpos, make):
     """Each array in turn with NaN, another type, another shape; each rate zero, negative, infinite, text, missing."""
