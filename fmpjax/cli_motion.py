@@ -154,8 +154,8 @@ class Synthesize:
 
     out: Path
     """File to write, .npz."""
-    speed: float = 0.85
-    """Along the path, m/s."""
+    speed: float | None = None
+    """Along the path, m/s; the robot's own by default, 0.85 for the G1."""
     turn: float = 0.0
     """To the left, rad/s."""
     duration: float = 8.0
@@ -165,7 +165,7 @@ class Synthesize:
     robot: str = "unitree_g1"
     """A robot under robots/."""
     style: Style = Style()
-    """How the walk looks: lengths m, angles rad, phases as fractions of a stride."""
+    """How the walk looks: lengths m, angles rad, phases as fractions of a stride; the robot's own by default."""
 
     def __call__(self) -> None:
         robot = robots.load(self.robot)

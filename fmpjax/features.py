@@ -65,13 +65,13 @@ def _rotation_terms(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _joint_rotations(robot: Robot, joints: jax.Array) -> jax.Array:
-    """6D rotations in body order with the jointless identity row, ``[..., 6 (J + 1)]``."""
+    """6D rotations in body order, ``[..., 6 J]``, with the identity row of a jointless body ``[..., 6 (J + 1)]``."""
     cosine, sine, constant = (jnp.asarray(t, joints.dtype) for t in _rotation_terms(robot))
     angle = joints[..., None]
     rows = jnp.cos(angle) * cosine + jnp.sin(angle) * sine + constant
-    identity = jnp.broadcast_to(jnp.array([1, 0, 0, 0, 0, 1], rows.dtype), (*rows.shape[:-2], 1, 6))
-    cut = robot.jointless_row
-    rows = jnp.concatenate([rows[..., :cut, :], identity, rows[..., cut:, :]], axis=-2)
+    if (cut := robot.jointless_row) is not None:
+        identity = jnp.broadcast_to(jnp.array([1, 0, 0, 0, 0, 1], rows.dtype), (*rows.shape[:-2], 1, 6))
+        rows = jnp.concatenate([rows[..., :cut, :], identity, rows[..., cut:, :]], axis=-2)
     return rows.reshape(*rows.shape[:-2], -1)
 
 
@@ -165,7 +165,8 @@ def observe(robot: Robot, qpos: jax.Array, qvel: jax.Array, observation: str) ->
 
 def frame_size(robot: Robot) -> int:
     """Numbers in a full frame of the prior, 239 for 29 joints."""
-    return 3 + 6 + 6 * (robot.joint_count + 1) + 3 * len(robot.key_body) + 3 + 3 + robot.joint_count
+    rows = robot.joint_count + (robot.jointless_row is not None)
+    return 3 + 6 + 6 * rows + 3 * len(robot.key_body) + 3 + 3 + robot.joint_count
 
 
 def velocity_index(robot: Robot) -> int:

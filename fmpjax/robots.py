@@ -1,7 +1,8 @@
 """The robot: its MuJoCo model and the facts about it that the rest of the program reads.
 
 A robot is a folder with ``robot.xml`` (MJCF: bodies, joints, servos, collision geoms) and ``robot.toml`` (key points,
-default pose, joints that the gait metrics read). Nothing else in the package names a joint or a body.
+default pose, joints that the gait metrics read, style of its walk). Nothing else in the package depends on a joint or a
+body of one robot.
 """
 
 import dataclasses
@@ -40,7 +41,7 @@ class Robot:
     body_position: np.ndarray  # [B, 3] m, in the parent
     body_rotation_wxyz: np.ndarray  # [B, 4], in the parent
     body_joint: np.ndarray  # [B] index of the body's hinge, -1 without
-    jointless_row: int  # row of the joint-rotation block that is always the identity
+    jointless_row: int | None  # row of the joint-rotation block that is always the identity, None without one
     key_point_names: tuple[str, ...]
     key_body: np.ndarray  # [K]
     key_offset: np.ndarray  # [K, 3] m, in the body
@@ -53,6 +54,7 @@ class Robot:
     sagittal_joints: np.ndarray  # [6] indices: left hip, knee, ankle, then right
     total_mass: float  # kg
     landmarks: dict[str, int]  # index of the body that stands for a human's pelvis, chest, left_hip and so on
+    gait: dict[str, float]  # how its walk departs from the G1's: `speed`, and fields of `fmpjax.motion.gait.Style`
 
     @property
     def joint_count(self) -> int:
@@ -120,7 +122,7 @@ def _read(name: str, path: Path) -> Robot:
         body_position=np.where(np.arange(model.nbody - 1)[:, None] == 0, 0.0, model.body_pos[1:]),
         body_rotation_wxyz=model.body_quat[1:].copy(),
         body_joint=body_joint,
-        jointless_row=index[facts["jointless_row_after"]] + 1,
+        jointless_row=index[facts["jointless_row_after"]] + 1 if "jointless_row_after" in facts else None,
         key_point_names=tuple(p["name"] for p in facts["key_points"]),
         key_body=np.array([model.body(p["body"]).id - 1 for p in facts["key_points"]]),
         key_offset=np.array([p.get("offset", (0.0, 0.0, 0.0)) for p in facts["key_points"]]),
@@ -133,6 +135,7 @@ def _read(name: str, path: Path) -> Robot:
         sagittal_joints=np.array([index[j] for j in facts["sagittal_joints"]]),
         total_mass=float(model.body_mass.sum()),
         landmarks={part: model.body(body).id - 1 for part, body in facts.get("landmarks", {}).items()},
+        gait=facts.get("gait", {}),
     )
     robot.default_qpos[2] -= lowest_sole(robot, robot.default_qpos)
     return robot

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from fmpjax import cli, motion, rotations
+from fmpjax import cli, motion, robots, rotations
 from fmpjax.errors import UserError
 from fmpjax.motion import gait, soles
 
@@ -144,12 +144,13 @@ def _clip(walk, qpos):
     ["turn_left", *(pytest.param(name, marks=pytest.mark.slow) for name in ("slow_walk", "fast_walk", "turn_right"))],
 )
 def test_library_is_what_the_package_writes(robot, name):
-    again, bundled = gait.synthesize(robot, **gait.LIBRARY[name]), motion.load(name)
+    again, bundled = gait.synthesize(robot, **gait.LIBRARY["unitree_g1"][name]), motion.load(name)
     np.testing.assert_allclose(again.qpos, bundled.qpos, atol=1e-4)
 
 
 def test_library_is_what_is_bundled():
-    assert motion.bundled() == sorted(gait.LIBRARY)
+    names = [*gait.LIBRARY["unitree_g1"], *(f"strider_{name}" for name in gait.LIBRARY["strider"])]
+    assert motion.bundled() == sorted(names) and sorted(gait.LIBRARY) == robots.available()
 
 
 @pytest.mark.parametrize(
@@ -188,7 +189,7 @@ def test_figures_of_the_library(robot, name, speed, turn, cadence):
 def test_library_touches_nothing_but_the_floor(robot):
     data = mujoco.MjData(robot.model)
     feet = {0, *(robot.sole_body + 1).tolist()}
-    for name in gait.LIBRARY:
+    for name in gait.LIBRARY["unitree_g1"]:
         for row in motion.load(name).qpos[:70:3]:
             data.qpos[:] = row
             mujoco.mj_forward(robot.model, data)

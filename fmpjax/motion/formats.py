@@ -21,7 +21,7 @@ LEAST_SAMPLES = 11  # one window of the motion prior: ten past frames and the pr
 
 
 def bundled() -> list[str]:
-    """Names of the shipped motions."""
+    """Names of the shipped motions; those of other robots than the G1 begin with the robot's."""
     return sorted(p.stem for p in resources.folder("motions").glob("*.npz"))
 
 
@@ -36,7 +36,8 @@ def load(
     """Load a motion and put it on the grid of ``rate``.
 
     Args:
-      path: a file of any format of `fmpjax.motion.readers`, or the name of a bundled motion such as ``"walk"``.
+      path: a file of any format of `fmpjax.motion.readers`, or the name of a bundled motion such as ``"walk"``,
+        which is each robot's own.
       fps: rate of the source rows, Hz; replaces the file's own.
       frames: source rows to use, 0-based, both ends included: ``(2370, 2580)`` or ``"2370:2580"``.
       rate: rate of the clip, Hz.
@@ -72,7 +73,7 @@ def record(
     _check_rate("fps", fps)
     span = _parse_frames(frames)
     loaded = robots.load(robot)
-    file = locate(path)
+    file = locate(path, robot)
     qpos, rate = readers.read(file, loaded)
     if span is not None:
         first, last = span
@@ -108,11 +109,12 @@ def save(clip: MotionClip, path: str | os.PathLike) -> Path:
     return path
 
 
-def locate(path: str | os.PathLike) -> Path:
-    """The file that ``path`` names: a bundled motion's or its own."""
+def locate(path: str | os.PathLike, robot: str = "unitree_g1") -> Path:
+    """The file that ``path`` names: a bundled motion's, of the robot where it has one of that name, or its own."""
     file = Path(path)
-    if file.name == str(path) and file.name in bundled():
-        return resources.folder("motions") / f"{file.name}.npz"
+    for name in (f"{robot}_{path}", str(path)):
+        if name in bundled():
+            return resources.folder("motions") / f"{name}.npz"
     if file.is_file():
         return file
     what = f"no motion file {file}" if file.suffix else f"unknown motion {str(path)!r}"

@@ -1,4 +1,4 @@
-"""Walks of our own for the Unitree G1: prescribed feet, pelvis and arms, inverse kinematics, balance by iteration.
+"""Walks of our own: prescribed feet, pelvis and arms, inverse kinematics, balance by iteration.
 
 The feet are given. A foot lands on the edge of its heel, rolls flat, stands, rolls over the edge of its toe and swings;
 edges roll without sliding. The legs follow by inverse kinematics. The path of the pelvis over the floor is then found
@@ -35,7 +35,7 @@ GRAVITY = 9.81  # m/s^2
 
 @dataclasses.dataclass(frozen=True)
 class Style:
-    """How the walk looks; lengths m, angles rad, phases as fractions of a stride."""
+    """How the walk looks; lengths m, angles rad, phases as fractions of a stride. Defaults are the G1's."""
 
     cadence: float = 1.85  # steps/s; rounded so that half a stride is a whole number of samples
     half_width: float = 0.085  # of each foot's centre from the line of travel
@@ -68,9 +68,16 @@ class Style:
     pressure_end: float = 0.099
     pressure_inward: float = 0.01  # toward the other foot
 
+    def on(self, robot: Robot) -> "Style":
+        """The style with what is left at its default as the robot walks."""
+        changed = {k: v for k, v in dataclasses.asdict(self).items() if v != getattr(Style(), k)}
+        own = {k: v for k, v in robot.gait.items() if k != "speed"}
+        return dataclasses.replace(Style(), **(own | changed))
 
-# The bundled motions, as keywords of `synthesize`.
-LIBRARY = {
+
+# The bundled motions by robot, as keywords of `synthesize`.
+LIBRARY = {"strider": {"walk": {}}}
+LIBRARY["unitree_g1"] = {
     "walk": {},
     "slow_walk": {
         "speed": 0.5,
@@ -110,7 +117,7 @@ LIBRARY = {
 def synthesize(
     robot: Robot,
     *,
-    speed: float = 0.85,
+    speed: float | None = None,
     turn: float = 0.0,
     duration: float = 8.0,
     rate: float = 50.0,
@@ -119,17 +126,19 @@ def synthesize(
     """A steady walk from the origin, along +x at first.
 
     Args:
-      robot: a robot with the G1's joints.
-      speed: along the path, m/s.
+      robot: a robot with two legs of six hinges; a waist and arms move where their joints have the G1's names.
+      speed: along the path, m/s; the robot's own by default, 0.85 for the G1.
       turn: of the path's direction, positive to the left, rad/s.
       duration: upper bound, s; the clip holds as many whole strides as fit, and the sample that closes the last.
       rate: samples per second, Hz.
-      style: how the walk looks.
+      style: how the walk looks; what is left at its default is as `Robot.gait` has it.
 
     Raises:
-      UserError: a number is not positive or the style's phases are out of order, a joint is missing, no stride fits, or
-        a foot is out of the leg's reach.
+      UserError: a number is not positive or the style's phases are out of order, the robot has not two legs of six
+        hinges, no stride fits, or a foot is out of the leg's reach.
     """
+    speed = robot.gait.get("speed", 0.85) if speed is None else speed
+    style = style.on(robot)
     for name, value, unit in (
         ("speed", speed, "m/s"),
         ("rate", rate, "Hz"),
@@ -283,17 +292,19 @@ class _Stride:
         turn = [rotations.exp_map(v) for v in (np.array([0, 0, yaw]), np.array([roll, 0, 0]))]
         turn.append(rotations.exp_map(np.array([0.0, s.pelvis_pitch, 0.0])))
         qpos[3:7] = rotations.multiply(rotations.multiply(turn[0], turn[1]), turn[2])
-        try:
-            qpos[j["waist_yaw_joint"]] = s.torso_yaw * forward - yaw
-            qpos[j["waist_roll_joint"]] = -roll
-            qpos[j["waist_pitch_joint"]] = s.torso_pitch - s.pelvis_pitch
-            for side, sign in (("left", 1.0), ("right", -1.0)):
-                back = sign * forward
-                qpos[j[f"{side}_shoulder_pitch_joint"]] = s.arm_centre + s.arm_swing * back
-                qpos[j[f"{side}_shoulder_roll_joint"]] = sign * s.arm_out
-                qpos[j[f"{side}_elbow_joint"]] = s.elbow + s.elbow_swing * back
-        except KeyError as missing:
-            raise UserError(f"robot {self.robot.name!r} has no joint {missing}, which the walk moves") from None
+        angles = {
+            "waist_yaw_joint": s.torso_yaw * forward - yaw,
+            "waist_roll_joint": -roll,
+            "waist_pitch_joint": s.torso_pitch - s.pelvis_pitch,
+        }
+        for side, sign in (("left", 1.0), ("right", -1.0)):
+            back = sign * forward
+            angles[f"{side}_shoulder_pitch_joint"] = s.arm_centre + s.arm_swing * back
+            angles[f"{side}_shoulder_roll_joint"] = sign * s.arm_out
+            angles[f"{side}_elbow_joint"] = s.elbow + s.elbow_swing * back
+        for name, angle in angles.items():
+            if name in j:
+                qpos[j[name]] = angle
         return qpos
 
     def pressure(self, phase: float) -> np.ndarray:
@@ -353,6 +364,8 @@ class _Leg:
             joints.append(robot.body_joint[body])
             body = robot.body_parent[body]
         self.joints = np.array(joints[::-1])
+        if len(joints) != 6 or min(joints) < 0:
+            raise UserError(f"robot {robot.name!r} has {len(joints)} bodies from root to foot, expected six hinges")
         own = robot.sole_body == foot
         points = robot.sole_point[own]
         self.radius = float(robot.sole_radius[own][0])
