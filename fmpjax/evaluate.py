@@ -18,6 +18,7 @@ from fmpjax.train import Trainer
 
 DETAILED = 64  # episodes whose joints and feet are analysed [P]
 WINDOWS = 512  # windows at most on either side of the Sinkhorn discrepancy [D]
+TURNS = 0.1  # rad/s, from which a demonstration turns [D]
 CONTACT_HEIGHT = 0.01  # m, a foot is in contact where a sole point is lower [D]
 
 
@@ -53,6 +54,8 @@ class Evaluation:
     late_speed: float  # m/s
     late_n: int  # episodes behind the late speed
     late_deviation: float  # m/s, between episodes
+    path_speed: float  # m/s, late, along the robot's own heading
+    turn: float  # rad/s, late, to the left
     excursion: float
     excursion_n: int
     amplitude_mae: float  # degrees
@@ -61,14 +64,19 @@ class Evaluation:
     imbalance: float
     displacement: float  # m
     demonstration_speed: float  # m/s
+    demonstration_turn: float  # rad/s
     joint_ranges: tuple[float, ...]  # degrees, six sagittal joints
     expert_ranges: tuple[float, ...]  # degrees
     motions: tuple[Share, ...] = ()  # where there are several
 
     @property
     def quality(self) -> float:
-        """Share of surviving episodes times late speed over the demonstration's (at most 1): what "best" means."""
-        speed = 0.0 if np.isnan(self.late_speed) else self.late_speed / max(self.demonstration_speed, 1e-6)
+        """Share of surviving episodes times late speed over the demonstration's (at most 1): what "best" means.
+
+        Where the demonstration turns, its speed is along the robot's own heading.
+        """
+        late = self.path_speed if abs(self.demonstration_turn) > TURNS else self.late_speed
+        speed = 0.0 if np.isnan(late) else late / max(self.demonstration_speed, 1e-6)
         return (1.0 - self.falls / self.episodes) * float(np.clip(speed, 0.0, 1.0))
 
     def as_dict(self) -> dict[str, float]:
@@ -141,6 +149,9 @@ class Evaluator:
         heading = rotations.yaw(played.start_qpos[:, 3:7].astype(np.float64))
         root = played.qpos[..., :3].astype(np.float64)
         speed = metrics.late_speed(root, played.length, heading, rate=rate)
+        path_speed, turn = metrics.late_course(
+            root, rotations.yaw(played.qpos[..., 3:7].astype(np.float64)), played.length, rate=rate
+        )
         displacement = metrics.forward_displacement(root, played.length, heading, played.start_qpos[:, :3])
 
         detail = slice(0, min(DETAILED, self.count))
@@ -161,6 +172,8 @@ class Evaluator:
             late_speed=late.mean,
             late_n=late.n,
             late_deviation=float(np.nanstd(speed)) if late.n else float("nan"),
+            path_speed=metrics.summarise(path_speed).mean,
+            turn=metrics.summarise(turn).mean,
             excursion=excursion.mean,
             excursion_n=excursion.n,
             amplitude_mae=metrics.summarise(metrics.amplitude_mae(ranges, expert)).mean,
@@ -169,6 +182,7 @@ class Evaluator:
             imbalance=metrics.summarise(metrics.left_right_imbalance(ranges)).mean,
             displacement=metrics.summarise(displacement).mean,
             demonstration_speed=float(library.mean(own_speed)),
+            demonstration_turn=float(library.mean([turning(clip) for clip in library.clips])),
             joint_ranges=tuple(np.degrees(_finite_mean(ranges)).round(2).tolist()),
             expert_ranges=tuple(np.degrees(expert).round(2).tolist()),
             motions=self._shares(played, speed, own_speed),
@@ -236,6 +250,12 @@ def planar_speed(clip: MotionClip) -> float:
     return float(np.linalg.norm(np.diff(clip.qpos[:, :2], axis=0), axis=-1).mean() * clip.rate)
 
 
+def turning(clip: MotionClip) -> float:
+    """Mean turning rate of a clip's root, rad/s, positive to the left."""
+    yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
+    return float(yaw[-1] - yaw[0]) / clip.duration
+
+
 def _defined(values: dict) -> dict:
     """Null in place of what is not defined, for JSON."""
     return {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in values.items()}
@@ -255,7 +275,8 @@ def table(evaluation: Evaluation) -> str:
         ("mean episode length", f"{e.mean_length:.1f}", "steps"),
         ("falls", f"{e.falls} of {e.episodes}", ""),
         ("late forward speed", f"{e.late_speed:.3f} ± {e.late_deviation:.3f}", f"m/s, n = {e.late_n}"),
-        ("demonstration's speed", f"{e.demonstration_speed:.3f}", "m/s"),
+        ("speed along its own heading", f"{e.path_speed:.3f}", f"m/s, turning at {e.turn:+.3f} rad/s"),
+        ("demonstration's speed", f"{e.demonstration_speed:.3f}", f"m/s, turning at {e.demonstration_turn:+.3f} rad/s"),
         ("excursion", f"{e.excursion:.3f}", f"of the expert's, n = {e.excursion_n}"),
         ("amplitude MAE", f"{e.amplitude_mae:.2f}", "degrees"),
         ("Sinkhorn discrepancy", f"{e.sinkhorn:.4f}", ""),

@@ -59,14 +59,55 @@ def late_speed(
       ``[N]``, NaN where excluded.
     """
     root_position = np.asarray(root_position, np.float64)
+    first, last, seconds = _late(length, rate, start, end)
+    moved = _rows(root_position, last) - root_position[min(first, len(root_position) - 1)]
+    return _forward(moved, heading) / seconds
+
+
+def late_course(
+    root_position: np.ndarray,
+    yaw: np.ndarray,
+    length: np.ndarray,
+    *,
+    rate: float = RATE,
+    start: float = LATE_START,
+    end: float = LATE_END,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Speed along the robot's own heading (m/s) and turning rate (rad/s, positive to the left) over the late steps.
+
+    What `late_speed` is for a demonstration that goes straight, for one that turns.
+
+    Args:
+      root_position: ``[T, N, 3]`` m.
+      yaw: ``[T, N]`` rad, of the root; whole turns do not matter.
+      length: ``[N]`` valid steps.
+      rate: Hz.
+      start: s.
+      end: s, included.
+
+    Returns:
+      Two of ``[N]``, NaN where `late_speed` excludes the episode.
+    """
+    root_position, yaw = np.asarray(root_position, np.float64), np.asarray(yaw, np.float64)
+    first, last, seconds = _late(length, rate, start, end)
+    turned = (np.diff(yaw, axis=0) + np.pi) % (2 * np.pi) - np.pi
+    moved, heading = np.diff(root_position, axis=0), yaw[:-1] + turned / 2
+    along = moved[..., 0] * np.cos(heading) + moved[..., 1] * np.sin(heading)
+
+    def mean(steps: np.ndarray) -> np.ndarray:
+        total = np.concatenate([np.zeros_like(steps[:1]), np.cumsum(steps, axis=0)])
+        return (_rows(total, last) - total[min(first, len(total) - 1)]) / seconds
+
+    return mean(along), mean(turned)
+
+
+def _late(length: np.ndarray, rate: float, start: float, end: float) -> tuple[int, np.ndarray, np.ndarray]:
+    """First late row, last one of each episode ``[N]``, seconds between ``[N]``, NaN where there are not two rows."""
     # Half a step of slack: row k is at (k + 1) / rate, whatever that rounds to.
     first = int(np.ceil(start * rate - 0.5)) - 1
     last = np.minimum(np.asarray(length), int(np.floor(end * rate + 0.5))) - 1
     included = last > first
-    last = np.where(included, last, 0)
-    moved = _rows(root_position, last) - root_position[min(first, len(root_position) - 1)]
-    seconds = np.where(included, last - first, 1) / rate
-    return np.where(included, _forward(moved, heading) / seconds, np.nan)
+    return first, np.where(included, last, 0), np.where(included, (last - first) / rate, np.nan)
 
 
 def forward_displacement(
