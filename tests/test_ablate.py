@@ -116,6 +116,9 @@ def test_ablate_writes_tables_and_curves(ablated):
         ("barycentric-fixed/seed0", 128), ("barycentric-fixed/seed0", 256),
     ]  # fmt: skip
     assert results["provenance"]["python"]
+    made = json.loads((folder / "out" / "fmp-fixed/seed0" / "provenance.json").read_text())
+    assert results["runs"]["fmp-fixed/seed0"]["commit"] == made["commit"]
+    assert str(folder) not in (folder / "out" / "results.json").read_text()
     rows = table.evaluations(planned[0], folder / "out")
     saved = json.loads((folder / "out" / "fmp-fixed/seed0" / "config.json").read_text())
     assert (rows[-1].method, rows[-1].reset, rows[-1].seed) == ("fmp", "fixed", saved["seed"])

@@ -45,8 +45,6 @@ def main(
       together: train all seeds of a method and reset as one program, which pays on an accelerator.
       video: film the final policies of each reset's first seed side by side.
     """
-    from fmpjax import runs
-
     specification = cells.read_specification(spec) if spec else Specification()
     named = {
         "preset": preset, "motion": motion, "frames": frames, "transitions": transitions,
@@ -55,7 +53,7 @@ def main(
     specification = dataclasses.replace(specification, **{k: v for k, v in named.items() if v is not None})
     planned = cells.plan(specification)
     cells.run(planned, out, workers, together=together)
-    paths = table.write(planned, out, runs.provenance())
+    paths = table.write(planned, out, [spec] if spec else [])
     print((out / "table.md").read_text())
     if video:
         paths += films(planned, out)

@@ -76,7 +76,7 @@ def save(
     from fmpjax import runs
 
     out.mkdir(parents=True, exist_ok=True)
-    written = json.dumps(_finite({**record, "provenance": runs.provenance()}), indent=1)
+    written = json.dumps(_finite({"provenance": runs.provenance(), **record}), indent=1)
     for place in sorted(map(str, places), key=len, reverse=True):
         written = written.replace(place, Path(place).name)
     runs.write(out / f"{name}.json", written)
@@ -84,9 +84,16 @@ def save(
     with partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
-        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+        writer.writerows({k: _cell(v) for k, v in row.items()} for row in rows)
     partial.replace(out / f"{name}.csv")
     return [out / f"{name}.json", out / f"{name}.csv"]
+
+
+def _cell(value: Any) -> Any:
+    """A value in a CSV file; empty where a number is not finite."""
+    if not isinstance(value, float):
+        return value
+    return f"{value:.6g}" if math.isfinite(value) else ""
 
 
 def _finite(value: Any) -> Any:

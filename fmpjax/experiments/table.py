@@ -1,6 +1,5 @@
 """The matched comparison's results: Table I and the learning curves, the paper's figures beside ours."""
 
-import csv
 import dataclasses
 import json
 import math
@@ -13,9 +12,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy import stats
 
+from fmpjax.experiments import results
 from fmpjax.experiments.cells import Cell
 from fmpjax.experiments.results import Verdict
 from fmpjax.logs import MetricsLog
+from fmpjax.motion import library
 
 TITLES = {
     "fmp": "FMP",
@@ -197,21 +198,24 @@ def curves(rows: Sequence[Row], paths: Sequence[Path]) -> None:
         figure.savefig(path)
 
 
-def write(cells: Sequence[Cell], folder: Path, provenance: dict[str, object]) -> list[Path]:
-    """Tables and curves of the cells' runs in ``folder``; the paths written."""
+def write(cells: Sequence[Cell], folder: Path, places: Iterable[Path | str] = ()) -> list[Path]:
+    """Tables and curves of the cells' runs in ``folder``, of which, as of the ``places``, only names are kept."""
     rows = [row for cell in cells for row in evaluations(cell, folder)]
     final = [rows_of[-1] for cell in cells if (rows_of := [r for r in rows if r.cell == cell.name])]
     flat = [{k: v for k, v in dataclasses.asdict(r).items() if k != "figures"} | r.figures for r in rows]
-    with (folder / "results.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, flat[0])
-        writer.writeheader()
-        writer.writerows({k: "" if v != v else v for k, v in line.items()} for line in flat)
-    plain = [{k: None if v != v else v for k, v in line.items()} for line in flat]
-    (folder / "results.json").write_text(json.dumps({"provenance": provenance, "evaluations": plain}, indent=1) + "\n")
+    motions = [name for cell in cells for name, _ in library.parse(cell.config.motion)]
+    # The cells may have been trained by other versions than the one that writes this.
+    runs = {cell.name: _origin(folder / cell.name / "provenance.json") for cell in cells}
+    results.save(folder, "results", {"runs": runs, "evaluations": flat}, flat, {folder, *places, *motions})
     (folder / "table.md").write_text(markdown(final) + "\n")
     (folder / "table.tex").write_text(latex(final) + "\n")
     curves(rows, [folder / "curves.png", folder / "curves.pdf"])
     return [folder / n for n in ("results.csv", "results.json", "table.md", "table.tex", "curves.png", "curves.pdf")]
+
+
+def _origin(path: Path) -> dict[str, Any]:
+    made = json.loads(path.read_text())
+    return {key: made[key] for key in ("commit", "uncommitted_changes", "date", "device")}
 
 
 def final(evaluations: Iterable[Mapping[str, Any]]) -> list[Row]:
