@@ -1,135 +1,436 @@
-"""How many transitions a second does training make, end to end, and where does the time go?
+"""How many transitions a second does training make, where does the time go, and what is the least it could take?
 
-The whole program is timed as a run calls it: iterations scanned and compiled. Its parts are compiled one by one and
-timed in turn with it on a state that it reached. The floor stands beside them: the physics alone on that state, which
-on a CPU is `mujoco.rollout` without JAX.
+Cases are numbers of environments, seeds and devices. Each is the whole program as a run calls it, iterations scanned
+and compiled, and all are timed in turn, round after round, so that a noisy machine disturbs them alike. Beside a case
+stand its parts, compiled one by one and timed on the state that it reached: physics alone (on a CPU `mujoco.rollout`
+without JAX), the rest of the rollout, features, fitting, scoring, PPO.
+
+A part's floors, with peaks measured in between:
+
+- its matrix products, counted in the traced program, at the rate of large ones;
+- its bytes: every array that the compiled program writes, once written and once read, at the rate of a large copy;
+- its launches: instructions that the compiled program executes, loops unrolled as far as their length is known.
+
+On a CPU several devices are fake ones that share its cores: there the figure to look at is what splitting costs. A case
+that does not fit the device's memory is said to, and the others go on.
 """
 
 import argparse
 import csv
-import dataclasses
-import resource
-import sys
+import itertools
+import os
+import re
 import time
+from collections import Counter
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import config, motion, priors
-from fmpjax.config import Config
-from fmpjax.physics.native import NativePhysics
-from fmpjax.train import Trainer, TrainState, _batch
-
 CALL = 30_000  # transitions in a call of the compiled program, about
+PEAK, COPY = 2048, 2**26  # side of the square product, floats of the copy that measure the machine
+
+# --- counting what a program executes --------------------------------------------------------------------------------
+
+_FREE = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast", "after-all", "partition-id", "replica-id"}
+_BYTES = {"pred": 1, "s8": 1, "u8": 1, "f16": 2, "bf16": 2, "s16": 2, "u16": 2, "f64": 8, "s64": 8, "u64": 8}
+
+
+class Instruction(NamedTuple):
+    """A line of a compiled program."""
+
+    shape: str
+    opcode: str
+    operands: list[str]
+    line: str
+    root: bool
+
+
+def parse(text: str) -> tuple[dict[str, dict[str, Instruction]], str]:
+    """Computations of a compiled program's text, instructions by name, and the entry's name."""
+    computations: dict[str, dict[str, Instruction]] = {}
+    entry, current = "", {}
+    for line in text.splitlines():
+        if line.endswith("{") and (header := re.match(r"(ENTRY )?%?([\w.\-]+) \(", line)):
+            current = computations.setdefault(header[2], {})
+            entry = header[2] if header[1] else entry
+        elif made := re.match(r"\s+(ROOT )?%?([\w.\-]+) = (\(.*?\)|\S+) ([\w\-]+)\((.*)", line):
+            operands = re.findall(r"%([\w.\-]+)", made[5].split("), ", 1)[0])
+            current[made[2]] = Instruction(made[3], made[4], operands, line, bool(made[1]))
+    return computations, entry
+
+
+def size(shape: str) -> int:
+    """Bytes of a shape such as ``f32[3,4]{1,0}``, or of a tuple of them."""
+    found = re.findall(r"(\w+)\[([\d,]*)\]", re.sub(r"/\*.*?\*/", "", shape))
+    return sum(_BYTES.get(kind, 4) * int(np.prod([int(n) for n in dims.split(",") if n])) for kind, dims in found)
+
+
+def executed(text: str) -> tuple[Counter[str], float]:
+    """Instructions that a compiled program executes, by kind, and the bytes that they write.
+
+    A loop of unknown length counts once, and of a branch the longer side.
+    """
+    computations, entry = parse(text)
+    known: dict[str, tuple[Counter[str], float]] = {}
+
+    def called(line: str, attribute: str) -> list[str]:
+        found = re.search(attribute + r"=(?:\{([^}]*)\}|(%?[\w.\-]+))", line)
+        return [name.lstrip("%") for name in (found[1] or found[2]).split(", ")] if found else []
+
+    def written(instruction: Instruction, inside: dict[str, Instruction]) -> float:
+        if instruction.opcode == "fusion":
+            body = computations[called(instruction.line, "calls")[0]]
+            root = next(i for i in body.values() if i.root)
+            return written(root, body) if root.opcode in ("dynamic-update-slice", "scatter") else size(root.shape)
+        # In place: what is new.
+        if instruction.opcode in ("dynamic-update-slice", "scatter"):
+            new = inside.get(instruction.operands[1 if instruction.opcode == "dynamic-update-slice" else -1])
+            return size(new.shape) if new else 0.0
+        return size(instruction.shape)
+
+    def of(name: str) -> tuple[Counter[str], float]:
+        if name in known:
+            return known[name]
+        count: Counter[str] = Counter()
+        total = 0.0
+        for instruction in computations[name].values():
+            if instruction.opcode in _FREE or instruction.opcode.endswith("-done"):
+                continue
+            if instruction.opcode == "while":
+                trips = re.search(r'"known_trip_count":\{"n":"(\d+)"', instruction.line)
+                parts = [of(n) for key in ("body", "condition") for n in called(instruction.line, key)]
+                times = int(trips[1]) if trips else 1
+            elif instruction.opcode == "conditional":
+                sides = ("branch_computations", "true_computation", "false_computation")
+                names = [name for key in sides for name in called(instruction.line, key)]
+                parts, times = [max((of(n) for n in names), key=lambda part: part[0].total())], 1
+            elif instruction.opcode == "call":
+                parts, times = [of(n) for n in called(instruction.line, "to_apply")], 1
+            else:
+                parts, times = [(Counter([instruction.opcode.removesuffix("-start")]), 0.0)], 1
+                total += written(instruction, computations[name])
+            for counted, moved in parts:
+                count.update({kind: times * n for kind, n in counted.items()})
+                total += times * moved
+        known[name] = count, total
+        return known[name]
+
+    return of(entry)
+
+
+def products(jaxpr) -> float:
+    """Floating-point operations of the matrix products in a traced program; a loop of unknown length counts once."""
+    from jax.extend.core import ClosedJaxpr, Jaxpr
+
+    total = 0.0
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            (contracted, _), _ = equation.params["dimension_numbers"]
+            left = equation.invars[0].aval.shape
+            total += 2.0 * np.prod(equation.outvars[0].aval.shape) * np.prod([left[i] for i in contracted])
+        inner = [p for value in equation.params.values() for p in (value if isinstance(value, tuple) else (value,))]
+        inner = [p.jaxpr if isinstance(p, ClosedJaxpr) else p for p in inner]
+        below = [products(p) for p in inner if isinstance(p, Jaxpr)]
+        if below:
+            most = max(below) if equation.primitive.name == "cond" else sum(below)
+            total += equation.params.get("length", 1) * most if equation.primitive.name == "scan" else most
+    return total
+
+
+# --- parts -----------------------------------------------------------------------------------------------------------
 
 
 def seconds(call: Callable[[], object]) -> float:
     """Time of a call, until its arrays are there."""
+    import jax
+
     began = time.perf_counter()
     jax.block_until_ready(call())
     return time.perf_counter() - began
 
 
-def peak_memory() -> float:
-    """Greatest resident memory of this process so far, MB."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1e6 if sys.platform == "darwin" else 1e3)
+def peaks() -> tuple[Callable[[], float], Callable[[], float]]:
+    """Calls that measure the rate of a large matrix product (FLOP/s) and of a large copy (bytes/s, both ways)."""
+    import jax
+    import jax.numpy as jnp
+
+    a, x = jnp.ones((PEAK, PEAK)), jnp.ones(COPY)
+    multiply, copy = jax.jit(lambda a: a @ a), jax.jit(lambda x: x + 1)
+    for call, of in ((multiply, a), (copy, x)):
+        jax.block_until_ready(call(of))
+    return lambda: 2.0 * PEAK**3 / seconds(lambda: multiply(a)), lambda: 8.0 * COPY / seconds(lambda: copy(x))
 
 
-def physics_alone(trainer: Trainer, state: TrainState) -> Callable[[], object]:
-    """A rollout's physics and nothing else, from the environments' present states."""
+class Part(NamedTuple):
+    """A compiled part of an iteration, and what it executes."""
+
+    call: Callable[[], object]
+    flops: float = 0.0
+    written: float = 0.0
+    launches: int = 0
+
+
+def physics_alone(trainer, state) -> Part:
+    """A rollout's physics and nothing else, from the environments' present states, of every seed at once."""
+    import jax
+    import jax.numpy as jnp
+
+    from fmpjax.physics.native import NativePhysics
+
     backend, steps = trainer.env.physics, trainer.config.ppo.rollout_steps
-    sim, count = state.env.physics, trainer.config.env.count
-    targets = jnp.broadcast_to(
-        trainer.env.actions(jnp.zeros(trainer.robot.joint_count)), (count, sim.qpos.shape[-1] - 7)
-    )
+    sim = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), state.env.physics)
+    targets = trainer.env.actions(jnp.zeros(trainer.robot.joint_count))
+    targets = jnp.broadcast_to(targets, (len(sim.qpos), len(targets)))
     if not isinstance(backend, NativePhysics):
-        scanned = jax.jit(lambda s, t: jax.lax.scan(lambda s, _: (backend.step(s, t), None), s, None, length=steps)[0])
-        return lambda: scanned(sim, targets)
+        return part(
+            lambda s, t: jax.lax.scan(lambda s, _: (backend.step(s, t), None), s, None, length=steps)[0], sim, targets
+        )
     qpos, qvel = np.asarray(sim.qpos, np.float64), np.asarray(sim.qvel, np.float64)
-    initial = np.concatenate([np.zeros((count, 1)), qpos, qvel], axis=1)
+    initial = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)
     control = np.repeat(np.asarray(targets, np.float64)[:, None], steps * backend.substeps, axis=1)
     warmstart = np.asarray(sim.warmstart, np.float64)
-    return lambda: backend._pool.rollout(backend.model, backend._data, initial, control, initial_warmstart=warmstart)[0]
+    pool, data = backend._pool, backend._data
+    return Part(lambda: pool.rollout(backend.model, data, initial, control, initial_warmstart=warmstart)[0])
 
 
-def parts(trainer: Trainer, state: TrainState) -> dict[str, Callable[[], object]]:
-    """The parts of one iteration as compiled calls on ``state``."""
-    env, ppo, steps = trainer.env, trainer.ppo, trainer.config.ppo.rollout_steps
-    key = jax.random.PRNGKey(0)
-    rollout = jax.jit(lambda s, k: env.rollout(s.env, ppo.act(s.ppo), k, steps))
-    windows = jax.jit(lambda s, r: trainer.feature_map(env.frame_table(s.env, r)[r.window]))
-    update = jax.jit(trainer.prior.update)
-    improve = jax.jit(lambda s, r, reward, k: ppo.update(s.ppo, _batch(r, reward), k))
-    _, record = rollout(state, key)
-    features = windows(state, record)
-    seen = priors.Rollout(features, ~record.nonfinite)
-    reward = update(state.prior, seen, key)[1]
-    return {
-        "rollout": lambda: rollout(state, key),
-        "features": lambda: windows(state, record),
-        "fit + score": lambda: update(state.prior, seen, key),
-        "PPO": lambda: improve(state, record, reward, key),
-    }
+def part(function: Callable[..., Any], *arguments: Any) -> Part:
+    """``function(*arguments)``, compiled."""
+    import jax
+
+    traced = jax.jit(function).trace(*arguments)
+    compiled = traced.lower().compile()
+    count, written = executed(compiled.as_text())
+    return Part(lambda: compiled(*arguments), products(traced.jaxpr.jaxpr), written, count.total())
 
 
-def measure(settings: Config, rounds: int) -> list[tuple[str, float, float, float]]:
-    """Rows ``name, ms an iteration, share of the parts, transitions/s``; prints what is no row."""
-    size = settings.transitions_per_iteration
-    settings = dataclasses.replace(settings, chunk=max(1, min(settings.chunk, round(CALL / size))))
-    clip = motion.load(settings.motion, rate=settings.control_rate, robot=settings.robot)
-    trainer = Trainer(settings, clip)
-    state = trainer.init()
+def parts(trainer, state, seeds: int) -> dict[str, Part]:
+    """The parts of one iteration on ``state``, which has an axis of seeds where there are several."""
+    import jax
+
+    from fmpjax import priors
+    from fmpjax.train import _batch
+
+    env, ppo, prior = trainer.env, trainer.ppo, trainer.prior
+    over = jax.vmap if seeds > 1 else lambda function: function
+    keys = jax.random.split(jax.random.PRNGKey(0), seeds) if seeds > 1 else jax.random.PRNGKey(0)
+    play = over(lambda s, k: env.rollout(s.env, ppo.act(s.ppo), k, trainer.config.ppo.rollout_steps)[1])
+    look = over(lambda s, r: trainer.feature_map(env.frame_table(s.env, r)[r.window]))
+    fit = over(lambda s, f, r, k: prior.update(s.prior, priors.Rollout(f, ~r.nonfinite), k)[1])
+    score = over(lambda s, f: prior.score(s.prior, f.reshape(-1, f.shape[-1])))
+    improve = over(lambda s, r, reward, k: ppo.update(s.ppo, _batch(r, reward), k)[0])
+    made = {"physics": physics_alone(trainer, state), "rollout": part(play, state, keys)}
+    record = made["rollout"].call()
+    made["features"] = part(look, state, record)
+    features = made["features"].call()
+    made["fit"] = part(fit, state, features, record, keys)
+    made["score"] = part(score, state, features)
+    made["PPO"] = part(improve, state, record, made["fit"].call(), keys)
+    return made
+
+
+def apart(figures: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Parts that do not overlap: the rollout without its physics, fitting without the scoring that ends an update."""
+    split = dict(figures)
+    split["rollout, rest"] = np.maximum(split.pop("rollout") - split["physics"], 0.0)
+    split["fit"] = np.maximum(split["fit"] - split["score"], 0.0)
+    return {name: split[name] for name in ("physics", "rollout, rest", "features", "fit", "score", "PPO")}
+
+
+# --- measuring -------------------------------------------------------------------------------------------------------
+
+
+class Case(NamedTuple):
+    """One program, compiled and warm."""
+
+    row: dict[str, float]
+    trainer: Any
+    program: Callable[[Any], Any]
+    state: list  # of one, as a call takes it and gives the next
+    transitions: int  # of a call
+    parts: dict[str, Part]
+
+
+def prepare(arguments, clip, environments: int, seeds: int, devices: int) -> Case:
+    """Compile a case, warm it up and take it apart."""
+    import jax
+    import jax.numpy as jnp
+
+    from fmpjax import sharding
+    from fmpjax.train import Trainer, stack
+
+    trainer = Trainer(settings_of(arguments, environments, seeds), clip)
+    settings = trainer.config
+    state = trainer.init() if seeds == 1 else stack([trainer.init(seed) for seed in range(seeds)])
+    state = state if devices == 1 else trainer.place(state, sharding.mesh(devices))
     began = time.perf_counter()
-    chunk = trainer.compile(state)
+    program = trainer.compile(state)
     compiled = time.perf_counter() - began
-    state, _ = jax.block_until_ready(chunk(state))
-    memory = peak_memory()
+    memory = program.memory_analysis()
+    count, _ = executed(program.as_text())
+    between = sum(n for kind, n in count.items() if kind.startswith(("all-", "collective-", "reduce-scatter")))
+    state, _ = jax.block_until_ready(program(state))
     # The compiled program takes its state's buffers; the parts keep a copy.
-    kept = jax.tree.map(jnp.copy, state)
-    calls = parts(trainer, kept) | {"physics alone": physics_alone(trainer, kept)}
-    for call in calls.values():
-        seconds(call)
-    whole, taken = [], []
-    for _ in range(rounds):
-        began = time.perf_counter()
-        state, _ = jax.block_until_ready(chunk(state))
-        whole.append((time.perf_counter() - began) / settings.chunk)
-        taken.append([seconds(call) for call in calls.values()])
-    *part, floor = np.median(taken, axis=0)
-    iteration = float(np.median(whole))
+    taken = parts(trainer, jax.tree.map(jnp.copy, state), seeds) if arguments.parts and devices == 1 else {}
+    for each in taken.values():
+        seconds(each.call)
+    row = {
+        "environments": settings.env.count, "seeds": seeds, "devices": devices, "compile_s": compiled,
+        "program_mb": (memory.temp_size_in_bytes + memory.argument_size_in_bytes) / 1e6,
+        "launches": count.total() / settings.chunk, "exchanges": between / settings.chunk,
+    }  # fmt: skip
+    peak = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+    row["device_peak_mb"] = peak / 1e6 if peak else float("nan")
+    transitions = seeds * settings.transitions_per_iteration * settings.chunk
+    return Case(row, trainer, program, [state], transitions, taken)
+
+
+def settings_of(arguments, environments: int, seeds: int = 1):
+    """A case's configuration: as many iterations in a call as make about `CALL` transitions."""
+    from fmpjax import config
+
+    changes = dict(item.split("=", 1) for item in arguments.set)
+    changes |= {"env.count": environments} if environments else {}
+    settings = config.preset(arguments.preset, **changes)
+    chunk = max(1, min(settings.chunk, round(CALL / seeds / settings.transitions_per_iteration)))
+    return config.preset(arguments.preset, **({"chunk": chunk} | changes))
+
+
+def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Lines of the table: a case's whole iteration, then its parts; prints them."""
+    import jax
+
+    from fmpjax import motion, runs
+    from fmpjax.errors import out_of_memory
+
+    settings = settings_of(arguments, 0)
+    clip = motion.load(settings.motion, rate=settings.control_rate, robot=settings.robot)
+    cases: list[Case] = []
+    for which in itertools.product(arguments.environments, arguments.seeds, arguments.devices):
+        try:
+            cases.append(prepare(arguments, clip, *which))
+        except (MemoryError, jax.errors.JaxRuntimeError) as error:
+            if not out_of_memory(error):
+                raise
+            print("{} environments, {} seeds, {} devices: out of memory, left out".format(*which), flush=True)
+    if not cases:
+        return []
+    product_rate, copy_rate = peaks()
+    rates, wholes, pieces = [], [], []
+    for _ in range(arguments.rounds):
+        rates.append((product_rate(), copy_rate()))
+        wholes.append([])
+        for case in cases:
+            began = time.perf_counter()
+            case.state[0], _ = jax.block_until_ready(case.program(case.state[0]))
+            wholes[-1].append((time.perf_counter() - began) / case.trainer.config.chunk)
+        pieces.append([[seconds(each.call) for each in case.parts.values()] for case in cases])
+    flop_rate, byte_rate = np.median(rates, axis=0)
+    first = cases[0].trainer
     print(
-        f"{settings.preset}: {settings.env.count} environments x {settings.ppo.rollout_steps} steps, "
-        f"{trainer.env.physics.name} physics at {1 / settings.physics.timestep:.0f} Hz, "
-        f"{settings.prior.updates} reward updates"
+        f"{arguments.preset} on {runs.machine()}: {first.env.physics.name} physics at "
+        f"{1 / first.config.physics.timestep:.0f} Hz, {first.config.prior.updates} reward updates; products at "
+        f"{flop_rate / 1e9:,.0f} GFLOP/s, copies at {byte_rate / 1e9:,.1f} GB/s"
     )
-    print(f"compiled in {compiled:.1f} s, peak memory {memory:,.0f} MB")
-    rows = [(name, 1e3 * t, t / sum(part), size / t) for name, t in zip(calls, part, strict=False)]
-    rows.append(("sum of the parts", 1e3 * sum(part), 1.0, size / sum(part)))
-    rows.append(("iteration, in the scan", 1e3 * iteration, iteration / sum(part), size / iteration))
-    rows.append(("floor: physics alone", 1e3 * floor, floor / sum(part), size / floor))
-    return rows
+    wholes, lines = np.array(wholes), []
+    for i, case in enumerate(cases):
+        per_iteration = case.transitions / case.trainer.config.chunk
+        whole = float(np.median(wholes[:, i]))
+        relative = wholes[:, i] / per_iteration
+        base = wholes[:, 0] / (cases[0].transitions / first.config.chunk)
+        head = case.row | {"part": "iteration", "ms": 1e3 * whole, "transitions_per_s": per_iteration / whole}
+        lines.append(head | {"to_the_first": float(np.median(base / relative))})
+        show(lines[-1])
+        if not case.parts:
+            continue
+        times = dict(zip(case.parts, np.median([r[i] for r in pieces], axis=0), strict=True))
+        figures = {n: np.array([times[n], p.flops, 2 * p.written, p.launches]) for n, p in case.parts.items()}
+        split = apart(figures)
+        total = sum(f[0] for f in split.values())
+        print(
+            f"  {'part':<16}{'ms':>10}{'share':>7}{'transitions/s':>15}{'GFLOP':>9}{'ms':>9}{'GB':>8}{'ms':>9}"
+            f"{'launches':>10}"
+        )
+        for name, (taken, flops, moved, launches) in split.items():
+            rate = per_iteration / taken if taken else float("nan")
+            line = {
+                "part": name, "ms": 1e3 * taken, "share": taken / total, "transitions_per_s": rate,
+                "gflop": flops / 1e9, "product_floor_ms": 1e3 * flops / flop_rate,
+                "gigabytes": moved / 1e9, "byte_floor_ms": 1e3 * moved / byte_rate, "launches": launches,
+            }  # fmt: skip
+            lines.append({k: case.row[k] for k in ("environments", "seeds", "devices")} | line)
+            print(
+                f"  {name:<16}{line['ms']:>10.1f}{100 * line['share']:>6.0f}%{line['transitions_per_s']:>15,.0f}"
+                f"{line['gflop']:>9.2f}{line['product_floor_ms']:>9.2f}{line['gigabytes']:>8.2f}"
+                f"{line['byte_floor_ms']:>9.2f}{line['launches']:>10,.0f}"
+            )
+        print(f"  {'sum':<16}{1e3 * total:>10.1f}", flush=True)
+    return lines
+
+
+def show(line: dict[str, Any]) -> None:
+    """Print a case's line."""
+    peak = "" if np.isnan(line["device_peak_mb"]) else f", device's peak so far {line['device_peak_mb']:,.0f} MB"
+    print(
+        f"{line['environments']} environments, {line['seeds']} seeds, {line['devices']} devices: "
+        f"{line['transitions_per_s']:,.0f} transitions/s, {line['to_the_first']:.2f} of the first; "
+        f"{line['ms']:,.1f} ms an iteration, {line['launches']:,.0f} launches, {line['exchanges']:,.0f} exchanges; "
+        f"compiled in {line['compile_s']:.0f} s, {line['program_mb']:,.0f} MB{peak}",
+        flush=True,
+    )
+
+
+def plot(lines: list[dict[str, Any]], path: str) -> None:
+    """Rate over environments, a line for each number of seeds and devices; physics alone dashed."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure((5, 3.5), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    for i, (seeds, devices) in enumerate(dict.fromkeys((line["seeds"], line["devices"]) for line in lines)):
+        for what, style in (("iteration", "-"), ("physics", "--")):
+            chosen = [
+                line for line in lines if (line["seeds"], line["devices"], line["part"]) == (seeds, devices, what)
+            ]
+            if not chosen:
+                continue
+            label = f"{seeds} seed{'s' if seeds > 1 else ''}, {devices} device{'s' if devices > 1 else ''}"
+            x, y = zip(*((line["environments"], line["transitions_per_s"]) for line in chosen), strict=True)
+            label = label if what == "iteration" else "  physics alone"
+            axes.plot(x, y, style, color=f"C{i}", marker="o", markersize=4, label=label)
+    axes.set_xscale("log", base=2)
+    axes.set_yscale("log")
+    axes.set_xlabel("environments")
+    axes.set_ylabel("transitions/s")
+    axes.grid(alpha=0.25, linewidth=0.5)
+    axes.legend(frameon=False, fontsize=8)
+    figure.savefig(path)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("preset", nargs="?", default="laptop", help="smoke, laptop (default) or paper")
-    parser.add_argument("--rounds", type=int, default=0, help="measurements of each part; 5, or 2 for the paper's size")
+    parser.add_argument("--environments", type=int, nargs="+", default=[0], help="0 for the preset's")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--devices", type=int, nargs="+", default=[1])
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--parts", action=argparse.BooleanOptionalAction, default=True, help="take one device apart")
+    parser.add_argument("--set", nargs="*", default=[], help="other settings, section.field=value")
     parser.add_argument("--csv", help="file for the table")
+    parser.add_argument("--png", help="file for the curves")
     arguments = parser.parse_args()
-    settings = config.preset(arguments.preset)
-    rounds = arguments.rounds or (5 if settings.transitions_per_iteration < CALL / 2 else 2)
-    rows = measure(settings, rounds)
-    print(f"{'part':<24}{'ms':>10}{'share':>8}{'transitions/s':>16}")
-    for name, ms, share, rate in rows:
-        print(f"{name:<24}{ms:>10.1f}{100 * share:>7.0f}%{rate:>16,.0f}")
-    if arguments.csv:
+    # Before JAX is imported; an accelerator's devices are what they are.
+    fake = f"--xla_force_host_platform_device_count={max(arguments.devices)}"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {fake}"
+    lines = measure(arguments)
+    if arguments.csv and lines:
         with open(arguments.csv, "w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(("part", "milliseconds", "share", "transitions_per_second"))
-            writer.writerows((name, f"{ms:.3f}", f"{share:.4f}", f"{rate:.1f}") for name, ms, share, rate in rows)
+            writer = csv.DictWriter(file, dict.fromkeys(key for line in lines for key in line))
+            writer.writeheader()
+            writer.writerows({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in line.items()} for line in lines)
+    if arguments.png and lines:
+        plot(lines, arguments.png)
 
 
 if __name__ == "__main__":
