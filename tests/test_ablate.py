@@ -3,6 +3,10 @@
 import json
 import math
 import re
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 
@@ -102,6 +106,24 @@ def ablated(tmp_path_factory):
     )
     ablate.cli(["--spec", str(folder / "plan.toml"), "--out", str(folder / "out"), "--workers", "2"])
     return folder, cells.plan(cells.read_specification(folder / "plan.toml"))
+
+
+@pytest.mark.slow
+def test_sigterm_ends_the_cells_too(tmp_path):
+    out = tmp_path / "out"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "fmpjax.experiments.ablate", "--preset", "smoke", "--methods", "fmp", "--out", str(out)],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    log, until = out / "fmp-dataset" / "seed0.log", time.monotonic() + 300
+    while not (log.exists() and log.read_text()) and time.monotonic() < until:
+        time.sleep(0.2)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=300) == 143
+    # The cell was waited for: it writes no more.
+    size = log.stat().st_size
+    time.sleep(2)
+    assert log.stat().st_size == size and not (out / "fmp-fixed").exists()
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@
 """
 
 import dataclasses
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -87,6 +88,8 @@ def films(planned: Sequence[Cell], folder: Path, seconds: float = 10.0) -> list[
 
 def cli(arguments: list[str] | None = None) -> None:
     """Entry point: bad input is one sentence and exit code 2."""
+    # An exception, so that who ends the comparison ends its cells, which save.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         tyro.cli(main, args=arguments)
     except UserError as error:
