@@ -3,17 +3,18 @@
 import contextlib
 import dataclasses
 import io
+import os
 import sys
 import warnings
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import tyro
 
 from fmpjax import config as configuration
 from fmpjax.cli_motion import Motion
-from fmpjax.errors import UserError
+from fmpjax.errors import UserError, out_of_memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,6 +260,15 @@ def _runs():
     """`fmpjax.runs`, imported when a command needs it, without MJX's word on stdout that Warp is not installed."""
     with contextlib.redirect_stdout(io.StringIO()):
         from fmpjax import runs
+    import jax
+
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError):  # which of them depends on the plugins that are installed
+        platforms = os.environ.get("JAX_PLATFORMS", "")
+        raise UserError(
+            f"JAX_PLATFORMS is {platforms!r}, and no such device is there: expected cpu, or a device that JAX sees"
+        ) from None
     return runs
 
 
@@ -280,10 +290,18 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         command()
     except UserError as error:
-        print(f"fmpjax: {error}", file=sys.stderr)
-        sys.exit(2)
+        _refuse(str(error))
     except KeyboardInterrupt:
         sys.exit(130)
+    except Exception as error:
+        if out_of_memory(error):
+            _refuse("out of memory: fewer --episodes, or a smaller env.count or evaluation_episodes, need less")
+        raise
+
+
+def _refuse(sentence: str) -> NoReturn:
+    print(f"fmpjax: {sentence}", file=sys.stderr)
+    sys.exit(2)
 
 
 if __name__ == "__main__":

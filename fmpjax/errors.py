@@ -6,3 +6,10 @@ class UserError(ValueError):
 
     The command line prints the sentence and exits with code 2; as a library the exception carries it.
     """
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that memory ran out, the host's or the device's, at compilation or in a program."""
+    return isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and any(word in str(error) for word in ("RESOURCE_EXHAUSTED", "MemoryError"))
+    )

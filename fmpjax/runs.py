@@ -1,5 +1,6 @@
 """A run on disk: its folder, its training from start or checkpoint to a clean end, and what it leaves to look at."""
 
+import contextlib
 import dataclasses
 import enum
 import importlib.metadata
@@ -12,7 +13,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from fmpjax import config as configuration
 from fmpjax import motion, sharding
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import Config
-from fmpjax.errors import UserError
+from fmpjax.errors import UserError, out_of_memory
 from fmpjax.evaluate import Evaluation, Evaluator, table
 from fmpjax.logs import MetricsLog, Progress, clock
 from fmpjax.train import Trainer, TrainState, stack, unstack
@@ -146,7 +147,15 @@ def train(*group: Run, resume: bool = False, minutes: float | None = None, devic
 
     Several runs that differ in nothing but their seeds are trained at once, as one program, each into its own folder.
     Several devices, all of them for None, share the environments or the seeds.
+
+    Raises:
+      UserError: the runs do not belong together, too much was not finite, or memory ran out; what was saved stays good.
     """
+    with _enough_memory(group):
+        return _train(*group, resume=resume, minutes=minutes, devices=devices)
+
+
+def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None) -> End:
     primary = sharding.primary()
     config, progress = group[0].config, Progress(show=primary)
     began = time.monotonic()
@@ -162,7 +171,7 @@ def train(*group: Run, resume: bool = False, minutes: float | None = None, devic
     if done >= config.iterations:
         progress.note(f"the budget of {config.transitions:,} transitions is spent: a larger --transitions would go on")
         return End.BUDGET
-    progress.note(f"{trainer.env.physics.name} physics on {_device_name()}; compiling, which takes a minute or so ...")
+    progress.note(f"{trainer.env.physics.name} physics on {machine()}; compiling, which takes a minute or so ...")
     compile_began = time.monotonic()
     state = states[0] if len(group) == 1 else stack(states)
     if devices != 1:
@@ -232,6 +241,25 @@ def train(*group: Run, resume: bool = False, minutes: float | None = None, devic
     end = End.SIGNAL if asked else End.TIME
     progress.note(f"{end.value} at {transitions:,} transitions; saved. Go on with --resume.")
     return end
+
+
+@contextlib.contextmanager
+def _enough_memory(group: Sequence[Run]) -> Iterator[None]:
+    """Say what to change where memory runs out."""
+    try:
+        yield
+    except Exception as error:
+        if not out_of_memory(error):
+            raise
+        config = group[0].config
+        less = f"env.count (now {config.env.count}) or prior.bank (now {config.prior.bank})"
+        less += f", or --seeds (now {len(group)})" if len(group) > 1 else ""
+        saved = set.intersection(*(run.checkpoints.iterations() for run in group))
+        kept = ""
+        if saved:
+            kept = f"; the checkpoint of iteration {max(saved):,} is whole: --resume goes on where there is more memory"
+            kept += ", or with some of the seeds" if len(group) > 1 else ""
+        raise UserError(f"out of memory on {machine()}: start a run with a smaller {less}{kept}") from error
 
 
 def _save(run: Run, state: TrainState, *, best: bool = False) -> None:
@@ -367,12 +395,13 @@ def provenance() -> dict[str, object]:
         "uncommitted_changes": None if changes is None else bool(changes),
         "python": platform.python_version(),
         "packages": {name: importlib.metadata.version(name) for name in _PACKAGES},
-        "device": _device_name(),
+        "device": machine(),
         "cores": len(os.sched_getaffinity(0)),
     }
 
 
-def _device_name() -> str:
+def machine() -> str:
+    """The device that JAX computes on, in words."""
     device = jax.devices()[0]
     return f"{len(os.sched_getaffinity(0))} CPU cores" if device.platform == "cpu" else device.device_kind
 
@@ -417,9 +446,12 @@ def _check_finite(run: Run, state: TrainState, config: Config) -> None:
         return
     path = run.folder / "nonfinite_state.npz"
     np.savez(path, **{name: np.asarray(value) for name, value in state.env.offender._asdict().items()})
+    physics = config.physics
+    full = f" or greater max_contacts (now {physics.max_contacts}) and max_constraints (now {physics.max_constraints})"
     raise UserError(
         f"{count} states or updates were not finite, more than nonfinite_limit, {config.nonfinite_limit}: "
-        f"the last state before one is in {path}; a smaller physics.timestep or learning rate may help"
+        f"the last state before one is in {path}; a smaller physics.timestep or learning rate"
+        f"{full + ', whose overflow counts too,' if physics.impl == 'warp' else ''} may help"
     )
 
 

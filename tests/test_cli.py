@@ -219,3 +219,14 @@ def test_process_says_one_sentence(tmp_path):
     assert done.stderr.startswith("fmpjax: unknown method 'nope'") and done.stderr.count("\n") == 1, done.stderr
     assert done.stdout == "", done.stdout
     assert not list(tmp_path.iterdir())
+
+
+def test_a_device_that_is_not_there(tmp_path):
+    """JAX finds its devices once in a process: hence one of its own."""
+    command = [sys.executable, "-m", "fmpjax.cli", *TRAIN, "--run", str(tmp_path / "run")]
+    done = subprocess.run(
+        command, env=os.environ | {"JAX_PLATFORMS": "cuda"}, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith("fmpjax: JAX_PLATFORMS is 'cuda', and no such device is there")
+    assert not (tmp_path / "run").exists()

@@ -210,3 +210,14 @@ def test_warp_without_its_device_is_refused(robot):
 def test_auto_is_native_on_a_cpu(robot):
     expected = "native" if jax.default_backend() == "cpu" else "mjx"
     assert physics.make(robot, PhysicsConfig()).name == expected
+
+
+def test_a_world_that_overflows_a_buffer_is_spoilt(robot):
+    """Warp's flags are bits of a world: those that mean lost contacts or constraints make its state not finite."""
+    from fmpjax.physics.mjx import spoil
+
+    state = physics.reset(jnp.zeros((3, 7)), jnp.zeros((3, 6)))
+    spoilt = jax.vmap(lambda s, flags: spoil(s, flags, 0b1011))(state, jnp.array([0, 0b100, 0b110]))
+    for leaf in spoilt:
+        np.testing.assert_array_equal(np.isnan(leaf).all(-1), [False, False, True])
+        np.testing.assert_array_equal(np.isnan(leaf).any(-1), [False, False, True])

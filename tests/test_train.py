@@ -422,3 +422,36 @@ def test_evaluations_start_from_matched_resets(trainer, evaluator, fallen):
     again = Evaluator(trainer, 6)
     np.testing.assert_array_equal(again.rows, evaluator.rows)
     np.testing.assert_array_equal(fallen.start_qpos, trainer.clip.qpos[evaluator.rows].astype(np.float32))
+
+
+def test_memory_that_runs_out_leaves_the_last_checkpoint_good(trained, tmp_path, monkeypatch, capsys):
+    """The third call of the program fails as XLA fails: a sentence, exit 2, and a run that goes on to the same end."""
+    folder = tmp_path / "short"
+    runs.Run.create(folder, tiny())
+    compiled = Trainer.compile
+
+    def compile_and_fail(self, state):
+        program, calls = compiled(self, state), []
+
+        def call(state):
+            calls.append(state)
+            if len(calls) == 3:
+                raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 9 bytes")
+            return program(state)
+
+        return call
+
+    monkeypatch.setattr(runs, "_SAVE_INTERVAL", -1.0)  # a checkpoint after every call
+    monkeypatch.setattr(Trainer, "compile", compile_and_fail)
+    with pytest.raises(UserError) as told:
+        runs.train(runs.Run.open(folder), resume=True)
+    assert "start a run with a smaller env.count (now 8) or prior.bank (now 16)" in str(told.value)
+    assert "the checkpoint of iteration 4 is whole: --resume goes on where there is more memory" in str(told.value)
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["train", "--run", str(folder), "--resume", "--set", "env.count=8"])
+    assert exit_.value.code == 2
+    assert capsys.readouterr().err.startswith("fmpjax: out of memory on ")
+    monkeypatch.undo()
+    assert runs.train(runs.Run.open(folder), resume=True) is runs.End.BUDGET
+    for name, leaf in leaves(trained).items():
+        np.testing.assert_array_equal(leaves(folder)[name], leaf, err_msg=name)

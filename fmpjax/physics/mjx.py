@@ -25,7 +25,12 @@ class MjxPhysics:
             self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
         if config.impl == "warp" and jax.default_backend() != "gpu":
             raise UserError("physics.impl is 'warp': expected an NVIDIA device, found " + jax.default_backend())
+        self._overflow = 0  # bits of Warp's word on a world that lost contacts or constraints to a full buffer
         try:
+            if config.impl == "warp":
+                from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType as Lost
+
+                self._overflow = int(Lost.NEFC | Lost.NJMAX_NNZ | Lost.BROADPHASE | Lost.NARROWPHASE)
             self._model = mjx.put_model(self.model, impl=config.impl)
             self._data(1)
         except (ImportError, RuntimeError) as error:
@@ -50,8 +55,15 @@ class MjxPhysics:
             data, _ = jax.lax.scan(
                 lambda d, _: (mjx.step(self._model, d), None), data, None, length=self.config.substeps
             )
-            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
+            reached = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
+            # A template's flags are clear, and steps add to them.
+            return spoil(reached, data._impl.overflow, self._overflow) if self._overflow else reached
 
         # TF32 in the constraint solver lets contacts sink.
         with jax.default_matmul_precision("highest"):
             return jax.vmap(one)(*state, jnp.asarray(targets, state.qpos.dtype))
+
+
+def spoil(state: PhysicsState, flags: jax.Array, bits: int) -> PhysicsState:
+    """The state of one world, not finite where its flags have one of the bits: so it is reset, and counted."""
+    return jax.tree.map(lambda x: jnp.where(jnp.any(flags & bits), jnp.nan, x), state)
