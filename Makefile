@@ -33,7 +33,8 @@ render: run-is-named $(READY) ## render a run's policy as a video: RUN=runs/walk
 
 # A file of tests at a time to each of two processes: most of the time is XLA's compiling, which uses one core.
 test: $(READY) ## run every test, in WORKERS processes (2)
-	$(BIN)/python -m pytest -n $(or $(WORKERS),2) --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n $(or $(WORKERS),2) --dist loadfile $(or $(ARGS),-m 'not alone')
+	$(if $(ARGS),,$(BIN)/python -m pytest -m alone)
 
 test-fast: $(READY) ## run the tests that take seconds
 	$(BIN)/python -m pytest -m 'not slow' $(ARGS)
