@@ -80,7 +80,8 @@ def films(planned: Sequence[Cell], folder: Path, seconds: float = 10.0) -> list[
             steps = slice(0, min(int(seconds * trainer.config.control_rate), int(played.length[0])), stride)
             motions.append(played.qpos[steps, 0])
             labels.append(table.title(cell.config.method, cell.variant))
-        frames = render.grid(trainer.robot, motions, labels, columns=min(3, len(motions)))
+        columns = len(motions) if len(motions) <= 3 else -(-len(motions) // 2)
+        frames = render.grid(trainer.robot, motions, labels, columns=columns)
         rate = trainer.config.control_rate / stride
         paths.append(render.write_video(folder / f"policies-{reset}.mp4", frames, fps=rate))
     return paths
