@@ -218,7 +218,7 @@ def test_missing_files(tmp_path):
     fails(r"no motion file .*nowhere\.csv: expected .* one of .*walk", tmp_path / "nowhere.csv")
     fails(r"unknown motion 'wlak': expected .* one of .*walk", "wlak")
     fails(r"unknown motion", tmp_path)
-    fails(r"unknown robot 'h1': expected one of unitree_g1", "walk", robot="h1")
+    fails(r"unknown robot 'h1': expected one of strider, unitree_g1", "walk", robot="h1")
     other = tmp_path / "clip.bvh"
     other.write_text("HIERARCHY")
     fails(r"clip\.bvh: a BVH skeleton, which `fmpjax motion retarget`", other)

@@ -200,7 +200,7 @@ def test_default_pose_stands_on_its_soles(robot, solved):
 
 
 def test_unknown_robot():
-    with pytest.raises(UserError, match="unknown robot 'atlas': expected one of unitree_g1"):
+    with pytest.raises(UserError, match="unknown robot 'atlas': expected one of strider, unitree_g1"):
         robots.load("atlas")
 
 
