@@ -79,11 +79,12 @@ class ActionMap(NamedTuple):
         return jnp.clip(self.center + self.scale * action, self.low, self.high).astype(action.dtype)
 
 
-def action_map(robot: Robot, library: MotionLibrary, kind: str) -> ActionMap:
+def action_map(robot: Robot, motion: MotionClip | MotionLibrary, kind: str) -> ActionMap:
     """The ``absolute`` map around zero, or the ``residual`` map around the demonstrations' mean pose."""
     if kind == "absolute":
         scale = 1.4 * np.maximum(np.abs(robot.joint_low), np.abs(robot.joint_high))
         return ActionMap(np.zeros_like(scale), scale, -scale, scale)
+    library = MotionLibrary.of(motion)
     return ActionMap(
         center=library.mean([clip.qpos[:, 7:].mean(0) for clip in library.clips]),
         scale=0.25 * robot.effort / robot.stiffness,
