@@ -127,6 +127,8 @@ class Env:
         """Table rows ``[count]`` at which episodes start under the configured regime."""
         if self.config.reset == "fixed":
             return jnp.full((count,), self.clip_rows)
+        if len(self.library.clips) == 1:
+            return jax.random.randint(key, (count,), self.horizon - 1, self.clip_rows)
         starts, lengths = self.library.starts, self.library.lengths
         weights = jnp.asarray(self.library.weights)
         clip = jax.random.choice(jax.random.fold_in(key, 1), len(starts), (count,), p=weights)
