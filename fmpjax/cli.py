@@ -124,7 +124,8 @@ class Train:
         if longer and sharding.primary():
             for run in group:
                 run.extend(asked["transitions"])
-        sharding.wait("extended")
+        if self.resume:  # else the first process is not here, and has nothing to extend
+            sharding.wait("extended")
         return group
 
     def _created(self):
