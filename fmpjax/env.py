@@ -170,19 +170,18 @@ class Env:
         during = before + count * self.horizon  # rows ahead of the rollout's own frames
 
         def step(carry, inputs):
-            sim, observed, age, window, offender = carry
+            sim, observed, age, window, offenders = carry
             index, key = inputs
             policy_key, reset_key = jax.random.split(key)
             action, extras = policy(observed.actor, policy_key)
-            before_step = sim
+            here = Offender(sim.qpos, sim.qvel, action)
             sim, reached, fell, finite = self._advance(sim, action)
-            first = jnp.argmin(finite)
-            here = Offender(before_step.qpos[first], before_step.qvel[first], action[first])
-            offender = jax.tree.map(lambda new, old: jnp.where(finite.all(), old, new), here, offender)
+            # Each environment keeps its own, which needs no word from the others while the rollout goes on.
+            offenders = jax.tree.map(lambda new, old: jnp.where(finite[:, None], old, new), here, offenders)
             age = age + 1
             timed_out = (age >= state.cap) & ~fell
             rows = during + index * count + jnp.arange(count)
-            window = jnp.concatenate([window[:, 1:], rows[:, None]], axis=1)
+            window = sharding.split(jnp.concatenate([window[:, 1:], rows[:, None]], axis=1))
             record = Steps(
                 observation=observed.actor,
                 next_observation=reached.actor,
@@ -208,16 +207,21 @@ class Env:
                 observed,
                 choose(jnp.zeros_like(age), age),
                 choose(self.history_rows(start), window),
-                offender,
+                offenders,
             )
             return carry, record
 
         window = before + jnp.arange(count * self.horizon).reshape(count, self.horizon)
-        (sim, observed, age, window, offender), record = jax.lax.scan(
+        nobody = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), state.offender)
+        (sim, observed, age, window, offenders), record = jax.lax.scan(
             step,
-            (state.physics, state.observed, state.age, window, state.offender),
+            (state.physics, state.observed, state.age, window, nobody),
             (jnp.arange(steps), jax.random.split(key, steps)),
         )
+        # The last step's first.
+        when = jnp.where(record.nonfinite, jnp.arange(1, steps + 1)[:, None], 0).max(0)
+        last = jnp.argmax(when)
+        offender = jax.tree.map(lambda new, old: jnp.where(when.any(), new[last], old), offenders, state.offender)
         history = self.frame_table(state, record)[window]
         new_state = state._replace(physics=sim, observed=observed, history=history, age=age, offender=offender)
         return self._grow_cap(new_state, record), record

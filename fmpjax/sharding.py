@@ -117,13 +117,19 @@ def per_device(function: Callable[..., Any]) -> Callable[..., Any]:
 
     Host callbacks need it: XLA cannot partition what it cannot see.
     """
+    return _mapped(function, PartitionSpec(AXIS))
 
+
+def alone(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that each device computes for itself on whole arrays, without a word from the others."""
+    return _mapped(function, PartitionSpec())
+
+
+def _mapped(function: Callable[..., Any], spec: PartitionSpec) -> Callable[..., Any]:
     def call(*arguments):
         if not _in_force():
             return function(*arguments)
-        return jax.shard_map(
-            function, in_specs=PartitionSpec(AXIS), out_specs=PartitionSpec(AXIS), check_vma=False
-        )(*arguments)  # fmt: skip
+        return jax.shard_map(function, in_specs=spec, out_specs=spec, check_vma=False)(*arguments)
 
     return call
 

@@ -86,7 +86,8 @@ class Trainer:
         """Roll out, fit the reward and score with it, improve the policy."""
         key, rollout_key, prior_key, ppo_key = jax.random.split(state.key, 4)
         env, steps = self.env.rollout(state.env, self.ppo.act(state.ppo), rollout_key, self.config.ppo.rollout_steps)
-        windows = self.feature_map(self.env.frame_table(state.env, steps)[steps.window])
+        # Devices split the windows as the prior does, by rows of the rollout: indices travel, windows do not.
+        windows = self.feature_map(self.env.frame_table(state.env, steps)[sharding.gather(steps.window)])
         prior, reward, prior_metrics = self.prior.update(
             state.prior, priors.Rollout(windows, ~steps.nonfinite), prior_key
         )

@@ -37,16 +37,19 @@ def split(windows: jax.Array, horizon: int) -> tuple[jax.Array, jax.Array]:
 def match(source: jax.Array, condition: jax.Array, expert: Expert, config: PriorConfig):
     """Dual ``[m]`` of an expert bank's conditions against a source bank's, and the entropy coefficient."""
     cost = transport.squared_cost(source, condition)
-    epsilon = transport.entropy_coefficient(cost, expert.dimension, config.epsilon_fraction)
-    # The self problem is not used; a one-point one costs nothing.
-    solution = transport.solve(
-        cost,
-        jnp.zeros((1, 1)),
-        epsilon,
-        threshold=config.sinkhorn_threshold,
-        max_iterations=config.sinkhorn_iterations,
-    )
-    return solution.expert_dual, epsilon, solution
+
+    def solve(cost):
+        # The self problem is not used; a one-point one costs nothing.
+        return transport.solve(
+            cost,
+            jnp.zeros((1, 1)),
+            transport.entropy_coefficient(cost, expert.dimension, config.epsilon_fraction),
+            threshold=config.sinkhorn_threshold,
+            max_iterations=config.sinkhorn_iterations,
+        )
+
+    solution = sharding.alone(solve)(cost)
+    return solution.expert_dual, solution.epsilon, solution
 
 
 def target(state: BarycentricState, condition: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from fmpjax import sharding
+from fmpjax import sharding, transport
+from fmpjax.config import PriorConfig
 
 PriorState = Any
 Metrics = Mapping[str, jax.Array]
@@ -62,6 +63,28 @@ def flatten(rollout: Rollout, stand_in: jax.Array) -> jax.Array:
     """All windows of a rollout, ``[T * N, D]``; ``stand_in [D]`` takes the place of those that are not finite."""
     features = jnp.where(rollout.valid[..., None], rollout.features, stand_in)
     return sharding.split(features.reshape(-1, features.shape[-1]))
+
+
+def couple(
+    source: jax.Array, expert: jax.Array, dimension: jax.Array | float, config: PriorConfig
+) -> tuple[jax.Array, jax.Array, transport.Solve]:
+    """Costs of a source bank ``[n, D]`` to the expert bank ``[m, D]`` and to itself, and their transport.
+
+    Devices share the costs' products; then each solves alone, which beats waiting for the others at every iteration.
+    """
+    rows = sharding.split(source)
+    cross, itself = transport.squared_cost(rows, expert), transport.squared_cost(rows, source)
+
+    def solve(cross, itself):
+        return transport.solve(
+            cross,
+            itself,
+            transport.entropy_coefficient(cross, dimension, config.epsilon_fraction),
+            threshold=config.sinkhorn_threshold,
+            max_iterations=config.sinkhorn_iterations,
+        )
+
+    return cross, itself, sharding.alone(solve)(cross, itself)
 
 
 class Reward(NamedTuple):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from fmpjax import sharding, transport
 from fmpjax.config import Config
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten, median_reward
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, couple, flatten, median_reward
 
 
 class EmpiricalState(NamedTuple):
@@ -26,16 +26,6 @@ class EmpiricalState(NamedTuple):
 def make(expert: Expert, config: Config) -> MotionPrior:
     """The mean of ``config.prior.score_banks`` transport scores; nothing is learned."""
     settings, windows = config.prior, expert.windows
-
-    def solve(source, bank):
-        cross = transport.squared_cost(source, bank)
-        return transport.solve(
-            cross,
-            transport.squared_cost(source, source),
-            transport.entropy_coefficient(cross, expert.dimension, settings.epsilon_fraction),
-            threshold=settings.sinkhorn_threshold,
-            max_iterations=settings.sinkhorn_iterations,
-        )
 
     def init(key):
         # Source banks of one window of the demonstration, until there is a rollout.
@@ -60,8 +50,8 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         bank, pool = windows[state.bank], flatten(rollout, windows[0])
 
         def one(key):
-            source = sharding.split(pool[jax.random.randint(key, (settings.bank,), 0, len(pool))])
-            return source, solve(source, bank)
+            source = sharding.gather(pool[jax.random.randint(key, (settings.bank,), 0, len(pool))])
+            return source, couple(source, bank, expert.dimension, settings)[-1]
 
         source, solutions = jax.lax.map(one, jax.random.split(key, settings.score_banks))
         state = EmpiricalState(state.bank, source, solutions.self_dual, solutions.expert_dual, solutions.epsilon)

@@ -14,7 +14,7 @@ import optax
 
 from fmpjax import potential, sharding, transport
 from fmpjax.config import Config, PriorConfig
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten, median_reward
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, couple, flatten, median_reward
 
 
 class FlowState(NamedTuple):
@@ -46,14 +46,7 @@ def teach(
       expert: ``[m, D]``.
       query: ``[q, D]`` or None.
     """
-    cross, itself = transport.squared_cost(source, expert), transport.squared_cost(source, source)
-    solution = transport.solve(
-        cross,
-        itself,
-        transport.entropy_coefficient(cross, dimension, config.epsilon_fraction),
-        threshold=config.sinkhorn_threshold,
-        max_iterations=config.sinkhorn_iterations,
-    )
+    cross, itself, solution = couple(source, expert, dimension, config)
     if query is None:
         query_to_expert, query_to_source = cross, itself
     else:
@@ -120,12 +113,13 @@ def losses(params, query, teacher: Teacher, flow: Flow, dimension, config: Prior
     contrast = jnp.broadcast_to(jnp.asarray(potential.SCORE_CONTRAST), (count, potential.HEADS))
     terms = {}
     if config.flow_weight:
-        points = jnp.concatenate([query, flow.point])
-        times = jnp.concatenate([jnp.zeros(count), flow.tau])
-        weights = jnp.concatenate([contrast, flow.head])
-        values, gradients = potential.contrast(params, points, times, weights, dimension)
-        terms["flow"] = jnp.mean(jnp.sum((gradients[count:] - flow.velocity) ** 2, axis=-1))
-        values, gradients = values[:count], gradients[:count]
+        # Side by side, not one after the other: each query's two points stay on its device.
+        pair = lambda a, b: jnp.stack([a, b], axis=1).reshape(2 * count, *a.shape[1:])  # noqa: E731
+        points, times = pair(query, flow.point), pair(jnp.zeros(count), flow.tau)
+        values, gradients = potential.contrast(params, points, times, pair(contrast, flow.head), dimension)
+        values, gradients = values.reshape(count, 2), gradients.reshape(count, 2, -1)
+        terms["flow"] = jnp.mean(jnp.sum((gradients[:, 1] - flow.velocity) ** 2, axis=-1))
+        values, gradients = values[:, 0], gradients[:, 0]
     else:
         values, gradients = potential.contrast(params, query, jnp.zeros(count), contrast, dimension)
     if config.endpoint_weight:
@@ -180,9 +174,9 @@ def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> Motio
     def fit_once(carry, key, expert_bank, pool, count):
         params, optimizer_state, average = carry
         bank_key, query_key, flow_key = jax.random.split(key, 3)
-        source = sharding.split(pool[jax.random.randint(bank_key, (config.bank,), 0, len(pool))])
+        source = sharding.gather(pool[jax.random.randint(bank_key, (config.bank,), 0, len(pool))])
         if config.query_is_bank:
-            query, teacher = source, teach(source, expert_bank, None, dimension, config)
+            query, teacher = sharding.split(source), teach(source, expert_bank, None, dimension, config)
         else:
             querying = max(1, int(config.query_share * count))  # the first environments supply the queries
             pick = jax.random.randint(query_key, (config.minibatch,), 0, len(pool) // count * querying)
