@@ -35,7 +35,7 @@ def read(file: Path, robot: Robot) -> Recording:
             found = line.count(",") + 1 if line.strip() else 0
             raise UserError(
                 f"{file}: line {number} has {found} columns, expected {columns} "
-                f"(root xyz, quaternion xyzw, {joint_count} joints)"
+                f"(root xyz, quaternion xyzw, {joint_count} joints of robot {robot.name!r})"
             )
     cells = ",".join(lines).split(",")
     try:

@@ -18,7 +18,7 @@ MARKS = ("fps", "frames")
 def read(file: Path, content: dict[str, object], robot: Robot) -> Recording:
     """The recording in a MimicKit motion."""
     columns = 6 + robot.joint_count
-    what = f"root xyz, rotation vector, {robot.joint_count} joints"
+    what = f"root xyz, rotation vector, {robot.joint_count} joints of robot {robot.name!r}"
     frames = table(file, "frames", numbers(file, "frames", content["frames"], columns), columns, what=what)
     turn = rotations.exp_map(frames[:, 3:6])
     return assemble(file, "frames", frames[:, :3], turn, frames[:, 6:], positive(file, "fps", content["fps"]))

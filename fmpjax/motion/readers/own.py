@@ -16,7 +16,7 @@ def read(file: Path, content: Arrays, robot: Robot) -> Recording:
     stored = "".join(content["robot"].ravel()[:1].astype(str))
     if stored != robot.name:
         raise UserError(f"{file}: the motion is for robot {stored[:60]!r}, expected {robot.name!r}")
-    what = f"root xyz, quaternion wxyz, {robot.joint_count} joints"
+    what = f"root xyz, quaternion wxyz, {robot.joint_count} joints of robot {robot.name!r}"
     qpos = table(file, "qpos", content["qpos"], 7 + robot.joint_count, what=what)
     rate = positive(file, "rate", content["rate"])
     return assemble(file, "qpos", qpos[:, :3], qpos[:, 3:7], qpos[:, 7:], rate)
