@@ -155,7 +155,7 @@ class Synthesize:
     out: Path
     """File to write, .npz."""
     speed: float | None = None
-    """Along the path, m/s; the robot's own by default, 0.85 for the G1."""
+    """Along the path, m/s; the robot's own by default."""
     turn: float = 0.0
     """To the left, rad/s."""
     duration: float = 8.0

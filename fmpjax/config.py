@@ -25,7 +25,7 @@ class PhysicsConfig:
     ls_iterations: int = 20  # line-search iterations at most [D]
     frictionloss: float = 0.1  # N m, joint friction [M]
     threads: int = 0  # threads of the native backend, 0 for every core [D]
-    max_contacts: int = 24  # contacts of one world, twice what a G1 can have, in the buffers of impl="warp" [D]
+    max_contacts: int = 24  # contacts of one world, twice what a robot here can have, in the buffers of impl="warp" [D]
     max_constraints: int = 256  # constraint rows of one world in the buffers of impl="warp" [D]
 
 

@@ -1,9 +1,10 @@
 """What the policy observes and what the prior scores (section IV-A of the paper).
 
-The full forms are 237 numbers for the actor and windows of ten 239-number frames for the prior. Most of a frame's joint
-rotations repeat each other: a hinge about y turns six coordinates of which two are constant and four are its sine and
-cosine, twice each. The program therefore keeps *compact frames* (117 numbers for 29 hinges) and gives the doubled
-coordinates the weight sqrt(2), which leaves every distance between windows what it was.
+Sizes follow from the robot. For the G1 the full forms are 237 numbers for the actor and windows of ten 239-number
+frames for the prior. Most of a frame's joint rotations repeat each other: a hinge about y turns six coordinates of
+which two are constant and four are its sine and cosine, twice each. The program therefore keeps *compact frames* (117
+numbers for 29 hinges) and gives the doubled coordinates the weight sqrt(2), which leaves every distance between windows
+what it was.
 """
 
 from typing import NamedTuple
@@ -76,7 +77,7 @@ def _joint_rotations(robot: Robot, joints: jax.Array) -> jax.Array:
 
 
 def actor_observation(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    """The policy's observation, ``[..., 237]`` for 29 joints.
+    """The policy's observation, ``[..., 237]`` for the G1.
 
     Root height (m), root rotation 6D, root velocity (m/s) and angular velocity (rad/s) in world axes, joint rotations
     6D, joint velocities (rad/s), key points less the root (m).
@@ -101,7 +102,7 @@ def actor_observation(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Arr
 
 
 def prior_window(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    """The prior's window before normalisation, ``[..., H * 239]`` for 29 joints, oldest frame first.
+    """The prior's window before normalisation, ``[..., H * 239]`` for the G1, oldest frame first.
 
     A frame is root position (m; x and y relative to the newest frame, z absolute), root rotation 6D, joint rotations
     6D, key points less that frame's root (m), root velocity (m/s), root angular velocity (rad/s), joint velocities
@@ -164,7 +165,7 @@ def observe(robot: Robot, qpos: jax.Array, qvel: jax.Array, observation: str) ->
 
 
 def frame_size(robot: Robot) -> int:
-    """Numbers in a full frame of the prior, 239 for 29 joints."""
+    """Numbers in a full frame of the prior, 239 for the G1."""
     rows = robot.joint_count + (robot.jointless_row is not None)
     return 3 + 6 + 6 * rows + 3 * len(robot.key_body) + 3 + 3 + robot.joint_count
 
@@ -199,7 +200,7 @@ class FeatureMap(NamedTuple):
     """The fixed map f from windows to the features that transport compares.
 
     Standardise with the demonstration's mean and deviation, clip, weigh, divide by sqrt(d), where d counts the full
-    frame's coordinates: distances are those of the full 2,390-dimensional features.
+    frame's coordinates: distances are those of the full features, 2,390 for the G1.
     """
 
     mean: jax.Array  # [H, F]

@@ -1,14 +1,15 @@
 """The robot: its MuJoCo model and the facts about it that the rest of the program reads.
 
 A robot is a folder with ``robot.xml`` (MJCF: bodies, joints, servos, collision geoms) and ``robot.toml`` (key points,
-default pose, joints that the gait metrics read, style of its walk). Nothing else in the package depends on a joint or a
-body of one robot.
+default pose, joints that the gait metrics read, its walk, its camera). Nothing else in the package names a joint or a
+body of one robot, or depends on their order.
 """
 
 import dataclasses
 import functools
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from fmpjax import resources
 from fmpjax.errors import UserError
 
+_FEET = ("left_foot_", "right_foot_")  # what the names of sole points begin with
 _LOOKS = 1  # geom group of what only the eye sees
 
 
@@ -51,10 +53,13 @@ class Robot:
     sole_body: np.ndarray  # [P]
     sole_point: np.ndarray  # [P, 3] m, centre of the sphere in the body
     sole_radius: np.ndarray  # [P] m
+    feet: np.ndarray  # [2] bodies of the left and the right sole points
     sagittal_joints: np.ndarray  # [6] indices: left hip, knee, ankle, then right
     total_mass: float  # kg
     landmarks: dict[str, int]  # index of the body that stands for a human's pelvis, chest, left_hip and so on
-    gait: dict[str, float]  # how its walk departs from the G1's: `speed`, and fields of `fmpjax.motion.gait.Style`
+    gait: dict[str, Any]  # its walk, as `fmpjax.motion.gait` reads it; empty for a robot without one
+    view_distance: float  # m from which a picture shows it whole
+    view_height: float  # m above the floor, where the camera looks
 
     @property
     def joint_count(self) -> int:
@@ -96,6 +101,7 @@ def load(name: str) -> Robot:
 
 def _read(name: str, path: Path) -> Robot:
     model = mujoco.MjModel.from_xml_path(str(path))
+    _check(path, model)
     facts = tomllib.loads(path.with_suffix(".toml").read_text())
     joint_names = tuple(model.joint(i).name for i in range(1, model.njnt))
     index = {joint: i for i, joint in enumerate(joint_names)}
@@ -132,13 +138,34 @@ def _read(name: str, path: Path) -> Robot:
         sole_body=np.array([g.bodyid[0] - 1 for g in soles]),
         sole_point=np.array([g.pos for g in soles]),
         sole_radius=np.array([g.size[0] for g in soles]),
+        feet=np.array([next(g.bodyid[0] - 1 for g in soles if g.name.startswith(side)) for side in _FEET]),
         sagittal_joints=np.array([index[j] for j in facts["sagittal_joints"]]),
         total_mass=float(model.body_mass.sum()),
         landmarks={part: model.body(body).id - 1 for part, body in facts.get("landmarks", {}).items()},
         gait=facts.get("gait", {}),
+        view_distance=facts["camera"]["distance"],
+        view_height=facts["camera"]["height"],
     )
     robot.default_qpos[2] -= lowest_sole(robot, robot.default_qpos)
     return robot
+
+
+def _check(path: Path, model: mujoco.MjModel) -> None:
+    """Refuse a model that the rest of the program, which has kinematics of its own, would misread."""
+    hinges, soles = np.arange(1, model.njnt), [g for g in map(model.geom, range(model.ngeom)) if "_foot_" in g.name]
+    feet = [{int(g.bodyid[0]) for g in soles if g.name.startswith(side)} for side in _FEET]
+    for holds, expected in (
+        (model.njnt > 1 and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE, "a root with a free joint, and hinges"),
+        ((model.jnt_type[1:] == mujoco.mjtJoint.mjJNT_HINGE).all(), "no joints but hinges beside the root's"),
+        (len(set(model.jnt_bodyid)) == model.njnt, "at most one hinge in a body"),
+        (not model.jnt_pos[1:].any(), "hinges at the origins of their bodies"),
+        (not model.qpos0[7:].any(), "angles that are zero as the model is drawn"),
+        (np.array_equal(model.actuator_trnid[:, 0], hinges), "one servo a hinge, in the order of the hinges"),
+        (all(g.name.startswith(_FEET) for g in soles), "soles named left_foot_... and right_foot_..."),
+        ([len(bodies) for bodies in feet] == [1, 1] and feet[0] != feet[1], "a left and a right foot, each one body"),
+    ):
+        if not holds:
+            raise UserError(f"{path}: expected {expected}")
 
 
 def _axis_ends(geom) -> np.ndarray:

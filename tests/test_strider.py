@@ -138,10 +138,12 @@ def test_its_walk_is_what_the_package_writes(strider, clip):
 
 
 def test_a_style_is_the_robots_where_it_is_not_named(strider, robot):
-    assert gait.Style().on(robot) == gait.Style()
     assert gait.Style().on(strider).pelvis_height == strider.gait["pelvis_height"]
     named = gait.Style(swing_lift=0.03).on(strider)
     assert named.swing_lift == 0.03 and named.half_width == strider.gait["half_width"]
+    # What is asked for counts, another robot's own number too; what nobody names is zero.
+    assert gait.Style(half_width=robot.gait["half_width"]).on(strider).half_width == robot.gait["half_width"]
+    assert gait.Style().on(strider).elbow == 0 and gait.Style().on(robot).elbow == robot.gait["elbow"]
 
 
 # --- the wrong robot -------------------------------------------------------------------------------------------------

@@ -35,44 +35,44 @@ GRAVITY = 9.81  # m/s^2
 
 @dataclasses.dataclass(frozen=True)
 class Style:
-    """How the walk looks; lengths m, angles rad, phases as fractions of a stride. Defaults are the G1's."""
+    """How the walk looks; lengths m, angles rad, phases as fractions of a stride. None leaves it to the robot."""
 
-    cadence: float = 1.85  # steps/s; rounded so that half a stride is a whole number of samples
-    half_width: float = 0.085  # of each foot's centre from the line of travel
-    toe_out: float = 0.04
+    cadence: float | None = None  # steps/s; rounded so that half a stride is a whole number of samples
+    half_width: float | None = None  # of each foot's centre from the line of travel
+    toe_out: float | None = None
     # The foot's pitch, positive with the toe down.
-    landing_pitch: float = -0.288
-    lowest_pitch: float = -0.356  # in late swing
-    highest_pitch: float = 0.75  # about toe-off
-    flat: float = 0.087  # the sole is flat from here
-    heel_off: float = 0.395  # to here
-    toe_off: float = 0.562
-    highest_at: float = 0.604
-    lowest_at: float = 0.962
+    landing_pitch: float | None = None
+    lowest_pitch: float | None = None  # in late swing
+    highest_pitch: float | None = None  # about toe-off
+    flat: float | None = None  # the sole is flat from here
+    heel_off: float | None = None  # to here
+    toe_off: float | None = None
+    highest_at: float | None = None
+    lowest_at: float | None = None
     # Added to the swing foot's height at its middle.
-    swing_lift: Annotated[float, tyro.conf.arg(aliases=["--step-height"])] = 0.0355
-    pelvis_height: float = 0.764  # mean
-    pelvis_bob: float = 0.0165  # half of the vertical travel, highest in mid-stance
-    pelvis_yaw: float = 0.07
-    pelvis_roll: float = 0.04
-    pelvis_pitch: float = 0.04
-    torso_yaw: float = 0.05  # against the pelvis
-    torso_pitch: float = 0.03
-    arm_swing: float = 0.32  # shoulder pitch, each way
-    arm_centre: float = 0.12  # shoulder pitch, positive backward
-    arm_out: float = 0.18  # shoulder roll
-    elbow: float = 1.15  # pi / 2 is a straight arm
-    elbow_swing: float = 0.15
+    swing_lift: Annotated[float | None, tyro.conf.arg(aliases=["--step-height"])] = None
+    pelvis_height: float | None = None  # mean
+    pelvis_bob: float | None = None  # half of the vertical travel, highest in mid-stance
+    pelvis_yaw: float | None = None
+    pelvis_roll: float | None = None
+    pelvis_pitch: float | None = None
+    torso_yaw: float | None = None  # against the pelvis
+    torso_pitch: float | None = None
+    arm_swing: float | None = None  # shoulder pitch, each way
+    arm_centre: float | None = None  # shoulder pitch, positive backward
+    arm_out: float | None = None  # shoulder roll
+    elbow: float | None = None
+    elbow_swing: float | None = None
     # The zero-moment point in the foot's frame, along the foot, at the start and end of single support.
-    pressure_start: float = -0.008
-    pressure_end: float = 0.099
-    pressure_inward: float = 0.01  # toward the other foot
+    pressure_start: float | None = None
+    pressure_end: float | None = None
+    pressure_inward: float | None = None  # toward the other foot
 
     def on(self, robot: Robot) -> "Style":
-        """The style with what is left at its default as the robot walks."""
-        changed = {k: v for k, v in dataclasses.asdict(self).items() if v != getattr(Style(), k)}
-        own = {k: v for k, v in robot.gait.items() if k != "speed"}
-        return dataclasses.replace(Style(), **(own | changed))
+        """The style with what it leaves open as ``robot.toml`` has it, or zero where that is silent."""
+        named = {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
+        own = {name: robot.gait.get(name, 0.0) for name in dataclasses.asdict(self)}
+        return Style(**(own | named))
 
 
 # The bundled motions by robot, as keywords of `synthesize`.
@@ -126,18 +126,20 @@ def synthesize(
     """A steady walk from the origin, along +x at first.
 
     Args:
-      robot: a robot with two legs of six hinges; a waist and arms move where their joints have the G1's names.
-      speed: along the path, m/s; the robot's own by default, 0.85 for the G1.
+      robot: a robot with two legs of six hinges; of waist and arms it moves the joints that its ``robot.toml`` names.
+      speed: along the path, m/s; the robot's own by default.
       turn: of the path's direction, positive to the left, rad/s.
       duration: upper bound, s; the clip holds as many whole strides as fit, and the sample that closes the last.
       rate: samples per second, Hz.
-      style: how the walk looks; what is left at its default is as `Robot.gait` has it.
+      style: how the walk looks; what it leaves open is as `Robot.gait` has it.
 
     Raises:
-      UserError: a number is not positive or the style's phases are out of order, the robot has not two legs of six
-        hinges, no stride fits, or a foot is out of the leg's reach.
+      UserError: the robot has no walk, or not two legs of six hinges; a number is not positive or the style's phases
+        are out of order; no stride fits, or a foot is out of the leg's reach.
     """
-    speed = robot.gait.get("speed", 0.85) if speed is None else speed
+    if not robot.gait:
+        raise UserError(f"robot {robot.name!r} has no [gait] in its robot.toml, which says how it walks")
+    speed = robot.gait["speed"] if speed is None else speed
     style = style.on(robot)
     for name, value, unit in (
         ("speed", speed, "m/s"),
@@ -210,11 +212,12 @@ class _Stride:
     def __init__(self, robot: Robot, length: float, angle: float, period: float, style: Style):
         self.robot, self.style, self.period, self.length, self.angle = robot, style, period, length, angle
         self.data = mujoco.MjData(robot.model)
-        feet = list(dict.fromkeys(robot.sole_body.tolist()))
-        if len(feet) != 2:
-            raise UserError(f"robot {robot.name!r} has {len(feet)} feet, expected two")
-        self.legs = [_Leg(robot, self.data, body) for body in feet]
-        self.joint = {name: 7 + i for i, name in enumerate(robot.joint_names)}
+        self.legs = [_Leg(robot, self.data, body) for body in robot.feet]
+        moved = robot.gait.get("joints", {})
+        missing = [name for name in moved.values() if name not in robot.joint_names]
+        if missing:
+            raise UserError(f"robot {robot.name!r} has no joint {missing[0]!r}, which its walk moves")
+        self.parts = [(part, 7 + robot.joint_names.index(name)) for part, name in moved.items()]
         s = style
         # Value, rate and acceleration at each knot; flat while the sole stands.
         landing_rate = -s.landing_pitch / s.flat
@@ -283,7 +286,7 @@ class _Stride:
 
     def upper(self, phase: float) -> np.ndarray:
         """``qpos [7 + J]`` in the walker's frame with everything but the legs and the pelvis' place over the floor."""
-        s, j = self.style, self.joint
+        s = self.style
         qpos = np.zeros(self.robot.model.nq)
         forward = np.cos(2 * np.pi * phase)  # 1 when the left foot lands, -1 when the right does
         stance = np.cos(2 * np.pi * (phase - 0.5 * (s.toe_off - 0.5) - 0.25))  # 1 in the left foot's mid-stance
@@ -293,18 +296,17 @@ class _Stride:
         turn.append(rotations.exp_map(np.array([0.0, s.pelvis_pitch, 0.0])))
         qpos[3:7] = rotations.multiply(rotations.multiply(turn[0], turn[1]), turn[2])
         angles = {
-            "waist_yaw_joint": s.torso_yaw * forward - yaw,
-            "waist_roll_joint": -roll,
-            "waist_pitch_joint": s.torso_pitch - s.pelvis_pitch,
+            "waist_yaw": s.torso_yaw * forward - yaw,
+            "waist_roll": -roll,
+            "waist_pitch": s.torso_pitch - s.pelvis_pitch,
         }
         for side, sign in (("left", 1.0), ("right", -1.0)):
             back = sign * forward
-            angles[f"{side}_shoulder_pitch_joint"] = s.arm_centre + s.arm_swing * back
-            angles[f"{side}_shoulder_roll_joint"] = sign * s.arm_out
-            angles[f"{side}_elbow_joint"] = s.elbow + s.elbow_swing * back
-        for name, angle in angles.items():
-            if name in j:
-                qpos[j[name]] = angle
+            angles[f"{side}_shoulder_pitch"] = s.arm_centre + s.arm_swing * back
+            angles[f"{side}_shoulder_roll"] = sign * s.arm_out
+            angles[f"{side}_elbow"] = s.elbow + s.elbow_swing * back
+        for part, column in self.parts:
+            qpos[column] = angles[part]
         return qpos
 
     def pressure(self, phase: float) -> np.ndarray:
@@ -333,7 +335,7 @@ class _Stride:
         wanted = _turned(np.array([self.pressure(p) for p in phase]) - origin, -heading)
         qpos = np.array([self.upper(p) for p in phase])
         qpos[:, 3:7] = rotations.multiply(_heading_wxyz(heading), qpos[:, 3:7])
-        omega2 = GRAVITY / (0.87 * self.style.pelvis_height)  # the centre of mass is lower than the pelvis' top
+        omega2 = GRAVITY / (0.87 * self.style.pelvis_height)  # the mass is about so high; iterating mends the rest
         frequency = np.fft.rfftfreq(samples, 1 / samples)
         gain = 1 / (1 + (2 * np.pi * frequency / self.period) ** 2 / omega2)
         gain[frequency > self.harmonics] = 0.0
@@ -363,9 +365,9 @@ class _Leg:
         while body > 0:
             joints.append(robot.body_joint[body])
             body = robot.body_parent[body]
-        self.joints = np.array(joints[::-1])
-        if len(joints) != 6 or min(joints) < 0:
-            raise UserError(f"robot {robot.name!r} has {len(joints)} bodies from root to foot, expected six hinges")
+        self.joints = np.array([joint for joint in joints[::-1] if joint >= 0])
+        if len(self.joints) != 6:
+            raise UserError(f"robot {robot.name!r} has {len(self.joints)} hinges in a leg: a walk needs six")
         own = robot.sole_body == foot
         points = robot.sole_point[own]
         self.radius = float(robot.sole_radius[own][0])
@@ -453,11 +455,10 @@ def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[s
       ``balance``: root mean square distance (m) of the zero-moment point from the box, along and
       across the path, around the points on the floor.
     """
-    feet = list(dict.fromkeys(robot.sole_body.tolist()))
     points, rotation = sole_points(robot, clip.qpos)
     height = points[:, :, 2] - robot.sole_radius
     touch = height < contact
-    down = np.stack([touch[:, robot.sole_body == foot].any(axis=1) for foot in feet], axis=1)
+    down = np.stack([touch[:, robot.sole_body == foot].any(axis=1) for foot in robot.feet], axis=1)
     joints = clip.qpos[:, 7:]
     sagittal = np.degrees(np.ptp(joints[:, robot.sagittal_joints], axis=0))
     names = [f"range_{side}_{joint}" for side in ("left", "right") for joint in ("hip", "knee", "ankle")]
@@ -478,7 +479,7 @@ def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[s
         "slip": slip(robot, points, rotation, touch),
         "penetration": float(max(0.0, -height.min())),
         "gap": float(height.min(axis=1).max()),
-        "clearance": _clearance(height, [robot.sole_body == foot for foot in feet], down),
+        "clearance": _clearance(height, [robot.sole_body == foot for foot in robot.feet], down),
         "limit_margin": float(np.minimum(joints - robot.joint_low, robot.joint_high - joints).min()),
         "joint_speed": float(np.abs(clip.qvel[:, 6:]).max()),
         # One-sided velocities at the ends would pass for jumps.

@@ -108,7 +108,7 @@ def _root(panels: np.ndarray, robot: Robot, clip: MotionClip, times: np.ndarray)
         panel.plot(times, values, color=COLOURS[2], linewidth=1)
     feet, turn = panels[2:]
     feet.set_title("lowest point of each foot, m", fontsize=9)
-    for foot, colour in zip(dict.fromkeys(robot.sole_body.tolist()), COLOURS, strict=False):
+    for foot, colour in zip(robot.feet, COLOURS, strict=False):
         feet.plot(times, height[:, robot.sole_body == foot].min(axis=1), color=colour, linewidth=1)
     feet.axhline(0, color="black", linewidth=0.8, linestyle=":")
     turn.set_title("turning speed, rad/s", fontsize=9)

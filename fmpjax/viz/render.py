@@ -29,8 +29,6 @@ from fmpjax.robots import Robot
 BACKENDS = ("egl", "osmesa", "skeleton")
 
 AZIMUTH, ELEVATION = 125.0, -10.0  # deg; the robot walks along +x, past the camera and a little towards it
-DISTANCE = 2.4  # m
-LOOK_HEIGHT = 0.66  # m; fixed, so that a fall is seen as one
 SMOOTHING = 12.0  # frames, standard deviation of the camera's path
 GHOST_RGBA = (0.20, 0.55, 0.95, 0.16)
 HIDDEN_GROUPS = slice(3, None)  # geoms that only collide or mark falls
@@ -115,7 +113,7 @@ def render_frames(
     if len(frames) == 0:
         return frames
     draw = _skeleton if using == "skeleton" else functools.partial(_scene, using)
-    look, distance = _camera_path(motions[0][:, :2], width / height, follow)
+    look, distance = _camera_path(robot, motions[0][:, :2], width / height, follow)
     with draw(robot, width, height, distance) as picture:
         for i, caption in enumerate(captions):
             frames[i] = picture([motion[i] for motion in motions], look[i])
@@ -274,6 +272,7 @@ def _skeleton(robot: Robot, width: int, height: int, distance: float) -> Iterato
     tall = 0.8 * distance  # m, what a picture shows from bottom to top
     wide = tall * width / height
     points_per_metre = 72 * height / PLOT_DPI / tall
+    size = robot.view_distance / 2.4  # the thickness of bones below is for this distance
     axes.axhspan(-tall, FLOOR_DEPTH * SHIFT[1], color="#dbe1e7", linewidth=0, zorder=0)
     marks = axes.add_collection(LineCollection([], colors="#bcc6d0", linewidths=1, zorder=1))
     bones = _Bones(robot)
@@ -293,12 +292,12 @@ def _skeleton(robot: Robot, width: int, height: int, distance: float) -> Iterato
                 LineCollection(
                     segments,
                     colors=tones[bones.tone],
-                    linewidths=0.045 * points_per_metre,
+                    linewidths=0.045 * size * points_per_metre,
                     capstyle="round",
                     zorder=3 - ghostly,
                 ),
                 EllipseCollection(
-                    *([0.15], [0.17], [0.0]),
+                    *([0.15 * size], [0.17 * size], [0.0]),
                     units="xy",
                     offsets=balls,
                     offset_transform=axes.transData,
@@ -359,16 +358,20 @@ class _Bones:
         return self._data.xpos[body] + np.einsum("nij,nj->ni", self._data.xmat[body].reshape(-1, 3, 3), offset)
 
 
-def _camera_path(root: np.ndarray, aspect: float, follow: bool) -> tuple[np.ndarray, float]:
-    """Points to look at ``[T, 3]`` and the camera's distance, m, for a root path ``[T, 2]``."""
+def _camera_path(robot: Robot, root: np.ndarray, aspect: float, follow: bool) -> tuple[np.ndarray, float]:
+    """Points to look at ``[T, 3]`` and the camera's distance, m, for a root path ``[T, 2]``.
+
+    Their height is fixed, so that a fall is seen as one.
+    """
     narrow = max(1.0, 0.8 / aspect)  # a tall pane steps back until a stride fits
     if follow:
-        centre, distance = gaussian_filter1d(root, SMOOTHING, axis=0, mode="nearest"), DISTANCE * narrow
+        centre = gaussian_filter1d(root, SMOOTHING, axis=0, mode="nearest")
+        distance = robot.view_distance * narrow
     else:
         span = np.ptp(root, axis=0)
         centre = np.broadcast_to(root.min(0) + span / 2, root.shape)
-        distance = DISTANCE * narrow + 1.2 * np.linalg.norm(span) / max(aspect, 1.0)
-    return np.column_stack([centre, np.full(len(root), LOOK_HEIGHT)]), distance
+        distance = robot.view_distance * narrow + 1.2 * np.linalg.norm(span) / max(aspect, 1.0)
+    return np.column_stack([centre, np.full(len(root), robot.view_height)]), distance
 
 
 def _captioned(image: np.ndarray, text: str) -> np.ndarray:
