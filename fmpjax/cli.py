@@ -71,6 +71,7 @@ class Train:
 
         if self.resume:
             group = self._resumed()
+            self._extend(group)
         else:
             # The first process makes the folders, the others find them.
             group = self._created() if sharding.primary() else None
@@ -119,14 +120,17 @@ class Train:
         for key in changes:
             if asked[key] != saved[key] and not (key == "transitions" and longer):
                 raise UserError(f"run {self.run} has {key} {saved[key]!r}: it cannot go on with {asked[key]!r}")
+        return group
+
+    def _extend(self, group) -> None:
+        """Give the runs the larger budget that a resume asks for; the first process writes it for all."""
         from fmpjax import sharding
 
-        if longer and sharding.primary():
-            for run in group:
-                run.extend(asked["transitions"])
-        if self.resume:  # else the first process is not here, and has nothing to extend
-            sharding.wait("extended")
-        return group
+        budget = configuration.with_changes(group[0].config, self._changes()).transitions
+        for run in group if sharding.primary() else ():
+            if budget > run.config.transitions:
+                run.extend(budget)
+        sharding.wait("extended")
 
     def _created(self):
         runs = _runs()

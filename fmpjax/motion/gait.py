@@ -139,7 +139,7 @@ def synthesize(
     """
     if not robot.gait:
         raise UserError(f"robot {robot.name!r} has no [gait] in its robot.toml, which says how it walks")
-    speed = robot.gait["speed"] if speed is None else speed
+    speed = robot.gait.get("speed", 0.0) if speed is None else speed
     style = style.on(robot)
     for name, value, unit in (
         ("speed", speed, "m/s"),
