@@ -50,6 +50,7 @@ class FeatureConfig:
     """Window features of the prior."""
 
     history: int = 10  # frames in a window, H [P]
+    axes: str = "world"  # of a window's vectors: "world" [P], or "heading", x forward in its newest frame [D]
     deviation_floor: float = 1e-4  # least standard deviation of a coordinate when standardising [M]
     angular_velocity_floor: float = 1e-4  # rad/s, the same of the joints' and the root's angular velocities [M]
     clip: float = 10.0  # standardised coordinates are clipped to this magnitude [P]
@@ -75,6 +76,7 @@ class PriorConfig:
     epsilon_fraction: float = 0.1  # entropy over the median cross cost [P]
     sinkhorn_threshold: float = 1e-3  # marginal error (L1) at which a solve has converged [D]
     sinkhorn_iterations: int = 200  # at most; what has not converged by then is counted [D]
+    parallel_solves: int = 0  # source banks solved side by side; 0 for one on a CPU, all on an accelerator [D]
     score_banks: int = 16  # source banks that method=bank16 averages [P]
     temperature: float = 1.0  # T of method=barycentric [D]
     spread_floor: float = 1e-6  # eta, least interquartile range in the reward [D]
@@ -316,6 +318,7 @@ def from_json(text: str) -> Config:
 _CHOICES = {
     "env.reset": ("dataset", "fixed"),
     "env.observation": ("full", "compact"),
+    "features.axes": ("world", "heading"),
     "env.action": ("absolute", "residual"),
     "amp.optimizer": ("sgd", "adam"),
     "physics.backend": ("auto", "native", "mjx"),
@@ -341,6 +344,9 @@ def validate(config: Config) -> Config:
     for key in _POSITIVE:
         if not flat[key] > 0:
             raise UserError(f"setting {key} is {flat[key]}: expected more than 0")
+    for key in ("prior.parallel_solves", "physics.threads"):
+        if flat[key] < 0:
+            raise UserError(f"setting {key} is {flat[key]}: expected 0 or more")
     for key in ("ppo.discount", "ppo.gae_lambda", "prior.query_share"):
         if not 0 < flat[key] <= 1:
             raise UserError(f"setting {key} is {flat[key]}: expected a number in (0, 1]")

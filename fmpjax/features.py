@@ -191,6 +191,34 @@ def compact_weights(robot: Robot) -> np.ndarray:
     )
 
 
+class _Planar(NamedTuple):
+    """Where the x and y of a compact frame's vectors stand."""
+
+    other: np.ndarray  # [F] int, of an x its y and of a y its x
+    sign: np.ndarray  # [F] 1 for an x, -1 for a y, 0 for what does not turn with the heading
+
+
+def _planar(robot: Robot) -> _Planar:
+    velocities = velocity_index(robot)
+    keys = range(9 + 2 * robot.joint_count, velocities, 3)
+    x = np.array([0, 3, 6, *keys, velocities, velocities + 3])
+    other, sign = (
+        np.arange(velocities + 6 + robot.joint_count),
+        np.zeros(velocities + 6 + robot.joint_count, np.float32),
+    )
+    other[x], other[x + 1] = x + 1, x
+    sign[x], sign[x + 1] = 1.0, -1.0
+    return _Planar(other, sign)
+
+
+def turned_windows(windows: jax.Array, planar: _Planar) -> jax.Array:
+    """Relative windows ``[..., H, F]`` in axes of which x points where the newest frame's root does."""
+    forward = windows[..., -1:, 3:5]
+    cosine, sine = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
+    turned = windows * cosine + windows[..., planar.other] * planar.sign * sine
+    return jnp.where(planar.sign == 0, windows, turned)
+
+
 def relative_windows(frames: jax.Array) -> jax.Array:
     """Windows ``[..., H, F]`` of compact frames with x and y made relative to the newest frame."""
     return frames.at[..., :2].add(-frames[..., -1:, :2])
@@ -208,10 +236,11 @@ class FeatureMap(NamedTuple):
     weight: jax.Array  # [F], multiplicity over sqrt(d)
     clip: jax.Array  # scalar
     dimension: jax.Array  # scalar, d
+    planar: _Planar | None = None  # set where windows are turned to their own heading
 
     def __call__(self, frames: jax.Array) -> jax.Array:
         """Features ``[..., H * F]`` of windows of compact frames ``[..., H, F]``, absolute or relative."""
-        z = (relative_windows(frames) - self.mean) / self.deviation
+        z = (_placed(frames, self.planar) - self.mean) / self.deviation
         x = jnp.clip(z, -self.clip, self.clip) * self.weight
         return x.reshape(*x.shape[:-2], -1)
 
@@ -221,7 +250,8 @@ def fit_feature_map(
 ) -> FeatureMap:
     """Feature map from the demonstrations' windows of compact frames ``[W, H, F]``, weighed by ``share [W]``."""
     dimension = config.history * frame_size(robot)
-    relative = np.asarray(relative_windows(windows), np.float64)
+    planar = _planar(robot) if config.axes == "heading" else None
+    relative = np.asarray(_placed(windows, planar), np.float64)
     mean = relative.mean(0) if share is None else np.average(relative, axis=0, weights=share)
     deviation = np.sqrt(np.average((relative - mean) ** 2, axis=0, weights=share))
     floor = np.full(relative.shape[-1], config.deviation_floor)
@@ -233,4 +263,10 @@ def fit_feature_map(
         weight=jnp.asarray(compact_weights(robot) / np.sqrt(dimension), jnp.float32),
         clip=jnp.float32(config.clip),
         dimension=jnp.float32(dimension),
+        planar=planar,
     )
+
+
+def _placed(frames: jax.Array, planar: _Planar | None) -> jax.Array:
+    relative = relative_windows(frames)
+    return relative if planar is None else turned_windows(relative, planar)

@@ -5,6 +5,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -235,6 +236,39 @@ def test_features_ignore_where_on_the_floor_the_window_is(robot, case):
     np.testing.assert_allclose(fitted(jnp.asarray(frames + shift)), fitted(jnp.asarray(frames)), atol=1e-5)
     shift[:3] = [0.0, 0.0, 0.02]
     assert np.abs(fitted(jnp.asarray(frames + shift)) - fitted(jnp.asarray(frames))).max() > 1e-3
+
+
+def test_heading_axes_ignore_which_way_the_window_goes(robot, walk):
+    """The whole motion turned about the vertical: the same features in heading axes, others in the world's."""
+    turn, index = np.float64(0.7), np.arange(30)[:, None] + np.arange(10)
+    qpos, qvel = np.array(walk.qpos[:40], np.float64), np.array(walk.qvel[:40], np.float64)
+    cosine, sine = np.cos(turn), np.sin(turn)
+    matrix = np.array([[cosine, -sine], [sine, cosine]])
+    turned_qpos, turned_qvel = qpos.copy(), qvel.copy()
+    turned_qpos[:, :2], turned_qvel[:, :2] = qpos[:, :2] @ matrix.T, qvel[:, :2] @ matrix.T
+    mujoco_turn = np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)])
+    for row in turned_qpos:
+        mujoco.mju_mulQuat(row[3:7], mujoco_turn, row[3:7].copy())
+    plain, turned = (
+        features.observe(robot, jnp.asarray(a, jnp.float32), jnp.asarray(b, jnp.float32), "compact").frame[index]
+        for a, b in ((qpos, qvel), (turned_qpos, turned_qvel))
+    )
+    own, world = (
+        features.fit_feature_map(
+            robot, plain, FeatureConfig(axes=axes, deviation_floor=0.05, angular_velocity_floor=0.05)
+        )
+        for axes in ("heading", "world")
+    )
+    np.testing.assert_allclose(own(turned), own(plain), atol=2e-5)
+    assert np.abs(world(turned) - world(plain)).max() > 0.05
+    # What a heading does not touch is what it was; the newest frame looks along x.
+    start = features.velocity_index(robot)
+    unturned = np.r_[2, 5, 8, 9:67, start + 2, start + 5, start + 6 : plain.shape[-1]]
+    placed = features.turned_windows(features.relative_windows(turned), own.planar)
+    np.testing.assert_array_equal(placed[..., unturned], turned[..., unturned])
+    np.testing.assert_allclose(placed[:, -1, 4], 0, atol=1e-6)
+    assert (placed[:, -1, 3] > 0.9).all()
+    np.testing.assert_allclose(placed[:, -1, start], np.linalg.norm(qvel[index[:, -1], :2], axis=-1), atol=0.1)
 
 
 def test_velocity_index_points_at_the_forward_velocity(robot, observed, reference):

@@ -131,7 +131,8 @@ def taught(banks):
 
     @jax.jit
     def teach(source, expert, query):
-        return tuple(flow.teach(source, expert, at, 3.0, TINY) for at in (None, source, query))
+        coupling = priors.couple(source, expert, 3.0, TINY)
+        return tuple(flow.teach(coupling, expert, at) for at in (None, source, query))
 
     return teach(banks["source"], banks["expert"], banks["query"])
 

@@ -117,13 +117,14 @@ def banks():
 def test_static_supervision_is_the_score_gradient_of_a_second_bank(banks):
     """At the dynamic samples' points, at time zero; the loss is eq. static."""
     query, params = banks["c"] + 0.1, potential.init(jax.random.PRNGKey(1), 3, 3.0, (8,))
-    teacher = flow.teach(banks["b"], banks["e"], query, 3.0, SMALL)
+    first, second = (priors.couple(banks[name], banks["e"], 3.0, SMALL) for name in "bc")
+    teacher = flow.teach(first, banks["e"], query)
     dynamic = flow.sample_flow(jax.random.PRNGKey(2), query, teacher, banks["b"], banks["e"])
-    static = flow.static_path(dynamic, banks["c"], banks["e"], 3.0, SMALL)
+    static = flow.static_path(dynamic, second, banks["e"])
     np.testing.assert_array_equal(static.point, dynamic.point)
     with jax.enable_x64(True):
-        second, expert, points = (np.asarray(x, np.float64) for x in (banks["c"], banks["e"], dynamic.point))
-        expected = np.asarray(jax.jit(lambda: transport.fit_score(second, expert).gradient(points))())
+        bank, expert, points = (np.asarray(x, np.float64) for x in (banks["c"], banks["e"], dynamic.point))
+        expected = np.asarray(jax.jit(lambda: transport.fit_score(bank, expert).gradient(points))())
     np.testing.assert_allclose(static.velocity, expected, atol=5e-3)
     params = params._replace(weights=tuple(w + 0.3 for w in params.weights))
     _, stats = flow.losses(params, query, teacher, static, 3.0, SMALL)

@@ -211,7 +211,7 @@ def paths(pool, expert, source, dimension, config: PriorConfig, key) -> list[jax
     """
     bank_key, draw_key = jax.random.split(key)
     bank = pool[jax.random.randint(bank_key, (config.bank,), 0, len(pool))]
-    teacher = flow.teach(bank, expert, source, dimension, config)
+    teacher = flow.teach(priors.couple(bank, expert, dimension, config), expert, source)
     target = flow.pick(jax.random.uniform(draw_key, source.shape[:1]), teacher.to_expert, expert)
     return [source + fraction * (target - source) for fraction in FRACTIONS]
 

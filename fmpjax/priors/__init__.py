@@ -3,7 +3,7 @@
 from fmpjax.config import Config
 from fmpjax.errors import UserError
 from fmpjax.priors import amp, barycentric, empirical, flow
-from fmpjax.priors.base import Expert, MotionPrior, Reward, Rollout, median_reward
+from fmpjax.priors.base import Expert, MotionPrior, Reward, Rollout, couple, median_reward
 
 _REGISTRY = {
     "fmp": flow.make,
@@ -32,4 +32,4 @@ def check(method: str) -> None:
         raise UserError(f"unknown method {method!r}: expected one of {', '.join(_REGISTRY)}")
 
 
-__all__ = ["METHODS", "Expert", "MotionPrior", "Reward", "Rollout", "check", "make", "median_reward"]
+__all__ = ["METHODS", "Expert", "MotionPrior", "Reward", "Rollout", "check", "couple", "make", "median_reward"]

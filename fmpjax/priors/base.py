@@ -65,26 +65,37 @@ def flatten(rollout: Rollout, stand_in: jax.Array) -> jax.Array:
     return sharding.split(features.reshape(-1, features.shape[-1]))
 
 
-def couple(
-    source: jax.Array, expert: jax.Array, dimension: jax.Array | float, config: PriorConfig
-) -> tuple[jax.Array, jax.Array, transport.Solve]:
-    """Costs of a source bank ``[n, D]`` to the expert bank ``[m, D]`` and to itself, and their transport.
+class Coupling(NamedTuple):
+    """A source bank and its transport."""
 
-    Devices share the costs' products; then each solves alone, which beats waiting for the others at every iteration.
+    source: jax.Array  # [n, D]
+    cross_cost: jax.Array  # [n, m]
+    self_cost: jax.Array  # [n, n]
+    solution: transport.Solve
+
+
+def couple(source: jax.Array, expert: jax.Array, dimension: jax.Array | float, config: PriorConfig) -> Coupling:
+    """Transport of a source bank ``[n, D]`` to the expert bank ``[m, D]`` and to itself."""
+    cross, itself = transport.squared_cost(source, expert), transport.squared_cost(source, source)
+    epsilon = transport.entropy_coefficient(cross, dimension, config.epsilon_fraction)
+    solution = transport.solve(
+        cross, itself, epsilon, threshold=config.sinkhorn_threshold, max_iterations=config.sinkhorn_iterations
+    )
+    return Coupling(source, cross, itself, solution)
+
+
+def couple_draws(
+    keys: jax.Array, pool: jax.Array, expert: jax.Array, dimension: jax.Array | float, config: PriorConfig
+) -> Coupling:
+    """Source banks drawn from a pool ``[N, D]``, one a key ``[k]``, and the transport of each, ``[k, ...]``.
+
+    No solve depends on another, nor on what is fitted to it: devices share them, and an accelerator, which waits for
+    launches rather than for arithmetic, solves its own at once.
     """
-    rows = sharding.split(source)
-    cross, itself = transport.squared_cost(rows, expert), transport.squared_cost(rows, source)
-
-    def solve(cross, itself):
-        return transport.solve(
-            cross,
-            itself,
-            transport.entropy_coefficient(cross, dimension, config.epsilon_fraction),
-            threshold=config.sinkhorn_threshold,
-            max_iterations=config.sinkhorn_iterations,
-        )
-
-    return cross, itself, sharding.alone(solve)(cross, itself)
+    rows = jax.vmap(lambda key: jax.random.randint(key, (config.bank,), 0, len(pool)))(keys)
+    batch = config.parallel_solves or (1 if jax.default_backend() == "cpu" else len(keys))
+    solve = sharding.spread(lambda source: couple(source, expert, dimension, config), batch)
+    return solve(sharding.gather(pool[rows]))
 
 
 class Reward(NamedTuple):

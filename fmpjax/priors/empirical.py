@@ -8,9 +8,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from fmpjax import sharding, transport
+from fmpjax import transport
 from fmpjax.config import Config
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, couple, flatten, median_reward
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, couple_draws, flatten, median_reward
 
 
 class EmpiricalState(NamedTuple):
@@ -49,12 +49,12 @@ def make(expert: Expert, config: Config) -> MotionPrior:
     def update(state: EmpiricalState, rollout: Rollout, key):
         bank, pool = windows[state.bank], flatten(rollout, windows[0])
 
-        def one(key):
-            source = sharding.gather(pool[jax.random.randint(key, (settings.bank,), 0, len(pool))])
-            return source, couple(source, bank, expert.dimension, settings)[-1]
-
-        source, solutions = jax.lax.map(one, jax.random.split(key, settings.score_banks))
-        state = EmpiricalState(state.bank, source, solutions.self_dual, solutions.expert_dual, solutions.epsilon)
+        keys = jax.random.split(key, settings.score_banks)
+        coupled = couple_draws(keys, pool, bank, expert.dimension, settings)
+        solutions = coupled.solution
+        state = EmpiricalState(
+            state.bank, coupled.source, solutions.self_dual, solutions.expert_dual, solutions.epsilon
+        )
         scores = score(state, pool).reshape(rollout.valid.shape)
         result = median_reward(scores, rollout.valid, settings.spread_floor)
         summary = {

@@ -1,6 +1,6 @@
 """Flow-Matched Motion Prior: the transport potential fitted online (sections III-C and III-D of the paper).
 
-Every update draws a source bank from the rollout, solves its transport to the expert bank and to itself, and takes one
+Every update has a source bank drawn from the rollout, its transport to the expert bank and to itself, and takes one
 Adam step on three losses: the centred value of the score, its gradient, and the flow along rollout-to-expert paths. The
 average of the rollout's parameters then scores every window.
 """
@@ -14,7 +14,7 @@ import optax
 
 from fmpjax import potential, sharding, transport
 from fmpjax.config import Config, PriorConfig
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, couple, flatten, median_reward
+from fmpjax.priors.base import Coupling, Expert, MotionPrior, Rollout, couple_draws, flatten, median_reward
 
 
 class FlowState(NamedTuple):
@@ -36,19 +36,16 @@ class Teacher(NamedTuple):
     solution: transport.Solve
 
 
-def teach(
-    source: jax.Array, expert: jax.Array, query: jax.Array | None, dimension: jax.Array, config: PriorConfig
-) -> Teacher:
-    """Solve one source bank and read score, gradient and matching probabilities at the queries.
+def teach(coupling: Coupling, expert: jax.Array, query: jax.Array | None) -> Teacher:
+    """Read score, gradient and matching probabilities of a solved source bank at the queries.
 
     Args:
-      source: ``[n, D]``; also the queries when ``query`` is None, which saves two cost matrices.
-      expert: ``[m, D]``.
-      query: ``[q, D]`` or None.
+      expert: ``[m, D]``, the bank that it was solved against.
+      query: ``[q, D]``; the source bank itself when None, which saves two cost matrices.
     """
-    cross, itself, solution = couple(source, expert, dimension, config)
+    source, solution = coupling.source, coupling.solution
     if query is None:
-        query_to_expert, query_to_source = cross, itself
+        query_to_expert, query_to_source = sharding.split((coupling.cross_cost, coupling.self_cost))
     else:
         query_to_expert = transport.squared_cost(query, expert)
         query_to_source = transport.squared_cost(query, source)
@@ -91,16 +88,16 @@ def sample_flow(key, query, teacher: Teacher, source, expert) -> Flow:
     return Flow(query + tau[:, None] * velocity, tau, jax.nn.one_hot(head, potential.HEADS), velocity)
 
 
-def static_path(flow: Flow, source, expert, dimension: jax.Array, config: PriorConfig) -> Flow:
+def static_path(flow: Flow, coupling: Coupling, expert: jax.Array) -> Flow:
     """Static supervision at the same points (eq. static): the score's gradient by a bank of its own, at time zero.
 
     Args:
       flow: whose points are asked.
-      source: ``[n, D]`` bank B', independent of the one that drew the points.
+      coupling: of a bank B', independent of the one that drew the points.
       expert: ``[m, D]``.
     """
     contrast = jnp.broadcast_to(jnp.asarray(potential.SCORE_CONTRAST), flow.head.shape)
-    gradient = teach(source, expert, flow.point, dimension, config).gradient
+    gradient = teach(coupling, expert, flow.point).gradient
     return Flow(flow.point, jnp.zeros_like(flow.tau), contrast, gradient)
 
 
@@ -171,21 +168,19 @@ def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> Motio
     def score(state: FlowState, x):
         return potential.score(state.average, x, dimension)
 
-    def fit_once(carry, key, expert_bank, pool, count):
+    def fit_once(carry, update, expert_bank, pool, count):
         params, optimizer_state, average = carry
-        bank_key, query_key, flow_key = jax.random.split(key, 3)
-        source = sharding.gather(pool[jax.random.randint(bank_key, (config.bank,), 0, len(pool))])
+        coupling, second, query_key, flow_key = update
         if config.query_is_bank:
-            query, teacher = sharding.split(source), teach(source, expert_bank, None, dimension, config)
+            query, teacher = sharding.split(coupling.source), teach(coupling, expert_bank, None)
         else:
             querying = max(1, int(config.query_share * count))  # the first environments supply the queries
             pick = jax.random.randint(query_key, (config.minibatch,), 0, len(pool) // count * querying)
             query = sharding.split(pool[pick // querying * count + pick % querying])
-            teacher = teach(source, expert_bank, query, dimension, config)
-        flow = sample_flow(flow_key, query, teacher, source, expert_bank)
+            teacher = teach(coupling, expert_bank, query)
+        flow = sample_flow(flow_key, query, teacher, coupling.source, expert_bank)
         if static:
-            second = pool[jax.random.randint(jax.random.fold_in(bank_key, 1), (config.bank,), 0, len(pool))]
-            flow = static_path(flow, second, expert_bank, dimension, config)
+            flow = static_path(flow, second, expert_bank)
         (total, stats), gradients = jax.value_and_grad(losses, has_aux=True)(
             params, query, teacher, flow, dimension, config
         )
@@ -209,10 +204,18 @@ def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> Motio
         # A window that is not finite is replaced by the first expert window: it neither spreads nor is rewarded.
         expert_bank = windows[state.bank]
         pool, shape = flatten(rollout, windows[0]), rollout.valid.shape
+        bank_keys, query_keys, flow_keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(
+            jax.random.split(key, config.updates)
+        )
+        first = couple_draws(bank_keys, pool, expert_bank, dimension, config)
+        second = None
+        if static:
+            second_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(bank_keys)
+            second = couple_draws(second_keys, pool, expert_bank, dimension, config)
         carry, metrics = jax.lax.scan(
-            lambda carry, key: fit_once(carry, key, expert_bank, pool, shape[1]),
+            lambda carry, update: fit_once(carry, update, expert_bank, pool, shape[1]),
             (state.params, state.optimizer, state.params),
-            jax.random.split(key, config.updates),
+            (first, second, query_keys, flow_keys),
         )
         state = FlowState(state.bank, *carry)
         result = median_reward(score(state, pool).reshape(shape), rollout.valid, config.spread_floor)
