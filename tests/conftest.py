@@ -7,6 +7,8 @@ from pathlib import Path
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Four fake devices, on which programs that several devices share are tested; everything else runs on the first.
 os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=4")
+# A device that waits for the others holds one of the threads of XLA, which makes one a core: too few are a deadlock.
+os.environ.setdefault("NPROC", str(2 * max(os.cpu_count() or 1, 4)))
 
 import pytest
 
