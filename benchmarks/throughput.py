@@ -423,7 +423,7 @@ def main() -> None:
     # Before JAX is imported; an accelerator's devices are what they are.
     fake = f"--xla_force_host_platform_device_count={max(arguments.devices)}"
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {fake}"
-    # A device that waits for the others holds one of the threads of XLA, which makes one a core: too few are a deadlock.
+    # A device that waits for the others holds one of XLA's threads, one a core: too few are a deadlock.
     if max(arguments.devices) > 1:
         os.environ.setdefault("NPROC", str(2 * max(os.cpu_count() or 1, *arguments.devices)))
     lines = measure(arguments)
