@@ -84,7 +84,7 @@ def test_settings_are_read_by_their_type():
         ({"env.reset": "anywhere"}, "expected one of dataset, fixed"),
         ({"ppo.discount": 1.5}, "ppo.discount is 1.5"),
         ({"ppo.actor_batch": 5}, "ppo.actor_batch is 5"),
-        ({"prior.minibatch": 8}, "prior.query_is_bank"),
+        ({"prior.minibatch": 8, "prior.query_is_bank": True}, "prior.query_is_bank"),
     ],
 )
 def test_bad_settings_are_named(changes, words):
