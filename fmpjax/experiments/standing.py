@@ -24,7 +24,8 @@ from fmpjax.config import Config, preset
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Evaluator
 from fmpjax.experiments import reference
-from fmpjax.priors.base import median_reward
+from fmpjax.priors import flow
+from fmpjax.priors.base import couple, median_reward
 from fmpjax.robots import Robot
 from fmpjax.train import Trainer, TrainState
 from fmpjax.viz import curves
@@ -186,11 +187,10 @@ def fits(trainer: Trainer, state: TrainState, moments: Moments, key: jax.Array) 
     """How the fitted potential, and one fitted 128 times more to the same windows, follow the transport."""
     config, dimension = trainer.config.prior, trainer.feature_map.dimension
     pool = moments.windows.reshape(-1, moments.windows.shape[-1])
+    expert = trainer.expert.windows[state.prior.bank]
     pick_key, bank_key, fit_key = jax.random.split(key, 3)
     query = pool[jax.random.randint(pick_key, (QUERIES,), 0, len(pool))]
-    truth = reference.reference(
-        pool, trainer.expert.windows[state.prior.bank], query, dimension, config, bank_key, BANKS
-    )
+    truth = reference.reference(pool, expert, query, dimension, config, bank_key, BANKS)
     spread = jnp.maximum(reference.spread(truth.score), config.spread_floor)
     longer = dataclasses.replace(trainer.config, prior=dataclasses.replace(config, updates=128))
     longer = priors.make(trainer.config.method, trainer.expert, longer)
@@ -202,6 +202,7 @@ def fits(trainer: Trainer, state: TrainState, moments: Moments, key: jax.Array) 
         row[f"{name}_correlation"] = reference.correlation(score, truth.score)
         row[f"{name}_error"] = jnp.abs(score - score.mean() - truth.score).mean() / spread
         row[f"{name}_gradient_cosine"] = reference.cosine(gradient, truth.gradient)
+    row |= _teachers(pool, expert, query, truth, dimension, config, bank_key)
     score = trainer.prior.score(state.prior, pool)
     spread = reference.spread(score)
     gain = trainer.prior.score(state.prior, moments.pushed.reshape(pool.shape)) - score
@@ -220,6 +221,20 @@ def fits(trainer: Trainer, state: TrainState, moments: Moments, key: jax.Array) 
     row["gradient_share_floored"] = (frame * floored).sum() / weight.sum()
     limit = trainer.feature_map.clip * jnp.tile(trainer.feature_map.weight, trainer.env.horizon)
     row["clipped_coordinates"] = (jnp.abs(query) >= limit * (1 - 1e-6)).mean()
+    return row
+
+
+def _teachers(pool, expert, query, truth, dimension, config, key) -> dict[str, jax.Array]:
+    """How one bank's transport teaches at windows of that bank, which the self-transport finds there, and at others."""
+    source = pool[jax.random.randint(jax.random.fold_in(key, 1), (config.bank,), 0, len(pool))]
+    source_truth = reference.reference(pool, expert, source, dimension, config, key, BANKS)
+    coupling = couple(source, expert, dimension, config)
+    row = {}
+    for name, at, true in (("bank", None, source_truth), ("apart", query, truth)):
+        teacher = flow.teach(coupling, expert, at)
+        row[f"teacher_{name}_correlation"] = reference.correlation(teacher.score, true.score)
+        row[f"teacher_{name}_gradient_cosine"] = reference.cosine(teacher.gradient, true.gradient)
+        row[f"teacher_{name}_own_share"] = teacher.to_source.max(-1).mean()  # of the nearest source window
     return row
 
 
