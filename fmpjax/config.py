@@ -68,7 +68,8 @@ class PriorConfig:
     hidden: tuple[int, ...] = (256, 256)  # trunk layers [P]
     learning_rate: float = 3e-4  # Adam [P]
     clip_norm: float = 10.0  # gradient-norm clip [P]
-    average_half_life: float = 16.0  # updates, half-life of the parameter average within a rollout [P]
+    average_half_life: float = 16.0  # updates, half-life of the parameter average [P]
+    average_restarts: bool = True  # at every rollout, from the current parameters [P]
     value_scale: float = 0.10  # c0 of the value loss, eq. (value) [P]
     value_weight: float = 1.0  # [P]
     endpoint_weight: float = 1.0  # [P]
@@ -177,7 +178,8 @@ class Config:
 # - physics at 100 Hz without joint friction, five Newton iterations: three times the paper's rate on a CPU;
 # - an episode cap that grows from 64 steps to 150, a time-out being no end: docs/learning.md says what either does;
 # - discount 0.97: a median-centred reward pays one a step for mere survival, worth 1/(1 - gamma);
-# - three reward updates a rollout of 4,096: the reward changes little between so small rollouts;
+# - three reward updates a rollout of 4,096: the reward changes little between so small rollouts; the average of the
+#   potential's parameters goes on over rollouts, since three updates are too few to average;
 # - feature deviations floored at 0.05, those of angular velocities at 0.5 rad/s: coordinates that the demonstration
 #   hardly moves would carry the distance;
 # - Adam with a rate that follows the KL divergence, small networks, learned deviation: sample efficiency.
@@ -199,6 +201,7 @@ _LAPTOP: dict[str, Any] = {
     "features.deviation_floor": 0.05,
     "features.angular_velocity_floor": 0.5,
     "prior.updates": 3,
+    "prior.average_restarts": False,
     "prior.query_share": 1.0,
     "prior.spread_floor": 1e-3,
     "amp.hidden": (256, 128),

@@ -25,6 +25,7 @@ def test_paper_preset_is_the_paper():
         "prior.learning_rate": 3e-4,
         "prior.clip_norm": 10.0,
         "prior.average_half_life": 16.0,
+        "prior.average_restarts": True,
         "prior.value_scale": 0.1,
         "prior.epsilon_fraction": 0.1,
         "prior.query_is_bank": False,

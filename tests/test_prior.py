@@ -303,6 +303,19 @@ def test_average_has_a_half_life_of_sixteen_updates_and_restarts(tiny, monkeypat
         np.testing.assert_allclose(average, 1.0, atol=1e-6)
 
 
+def test_average_that_goes_on(monkeypatch):
+    """With parameters that are the constant 1, sixteen updates from an average of 0 take it to a half."""
+    _, expert = np.random.default_rng(0).normal(size=(2, 32, 3))
+    points = np.random.default_rng(1).normal(size=(STEPS * COUNT, 3))
+    prior = make("fmp", expert, dataclasses.replace(TINY, average_restarts=False))
+    monkeypatch.setattr(optax, "apply_updates", lambda params, _: jax.tree.map(jnp.ones_like, params))
+    start = prior.init(jax.random.PRNGKey(3))
+    start = start._replace(average=jax.tree.map(jnp.zeros_like, start.average))
+    state, _, _ = jax.jit(prior.update)(start, rollout_of(points), jax.random.PRNGKey(4))
+    for average in jax.tree.leaves(state.average):
+        np.testing.assert_allclose(average, 0.5, atol=1e-5)
+
+
 def test_optimiser_state_persists_between_rollouts(tiny):
     _, update, state, points = tiny
     count = lambda s: int(optax.tree_utils.tree_get(s.optimizer, "count"))  # noqa: E731

@@ -2,7 +2,7 @@
 
 Every update has a source bank drawn from the rollout, its transport to the expert bank and to itself, and takes one
 Adam step on three losses: the centred value of the score, its gradient, and the flow along rollout-to-expert paths. The
-average of the rollout's parameters then scores every window.
+average of the updates' parameters then scores every window.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ class FlowState(NamedTuple):
     bank: jax.Array  # [m] int32, rows of the demonstration's windows: E of the paper, drawn once
     params: potential.Params
     optimizer: optax.OptState
-    average: potential.Params  # averaged over the last rollout's updates; it scores
+    average: potential.Params  # averaged over updates, the last rollout's alone if it restarts; it scores
 
 
 class Teacher(NamedTuple):
@@ -214,7 +214,7 @@ def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> Motio
             second = couple_draws(second_keys, pool, expert_bank, dimension, config)
         carry, metrics = jax.lax.scan(
             lambda carry, update: fit_once(carry, update, expert_bank, pool, shape[1]),
-            (state.params, state.optimizer, state.params),
+            (state.params, state.optimizer, state.params if config.average_restarts else state.average),
             (first, second, query_keys, flow_keys),
         )
         state = FlowState(state.bank, *carry)
