@@ -71,13 +71,13 @@ class Evaluation:
 
     @property
     def quality(self) -> float:
-        """Share of surviving episodes times late speed over the demonstration's (at most 1): what "best" means.
+        """Share of surviving episodes times one less the relative error of the late speed: what "best" means.
 
-        Where the demonstration turns, its speed is along the robot's own heading.
+        Too fast is no better than too slow. Where the demonstration turns, speeds are along the own heading.
         """
         late = self.path_speed if abs(self.demonstration_turn) > TURNS else self.late_speed
-        speed = 0.0 if np.isnan(late) else late / max(self.demonstration_speed, 1e-6)
-        return (1.0 - self.falls / self.episodes) * float(np.clip(speed, 0.0, 1.0))
+        error = 1.0 if np.isnan(late) else abs(late - self.demonstration_speed) / max(self.demonstration_speed, 0.1)
+        return (1.0 - self.falls / self.episodes) * max(0.0, 1.0 - error)
 
     def as_dict(self) -> dict[str, float]:
         """Scalar figures, by name."""

@@ -305,7 +305,7 @@ def test_average_has_a_half_life_of_sixteen_updates_and_restarts(tiny, monkeypat
 
 def test_average_that_goes_on(monkeypatch):
     """With parameters that are the constant 1, sixteen updates from an average of 0 take it to a half."""
-    _, expert = np.random.default_rng(0).normal(size=(2, 32, 3))
+    expert = np.random.default_rng(0).normal(size=(32, 3))
     points = np.random.default_rng(1).normal(size=(STEPS * COUNT, 3))
     prior = make("fmp", expert, dataclasses.replace(TINY, average_restarts=False))
     monkeypatch.setattr(optax, "apply_updates", lambda params, _: jax.tree.map(jnp.ones_like, params))

@@ -22,7 +22,7 @@ from fmpjax import cli, config, runs
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import preset
 from fmpjax.errors import UserError
-from fmpjax.evaluate import Episodes, Evaluator
+from fmpjax.evaluate import Episodes, Evaluation, Evaluator
 from fmpjax.priors import Expert
 from fmpjax.train import Trainer
 
@@ -455,3 +455,22 @@ def test_memory_that_runs_out_leaves_the_last_checkpoint_good(trained, tmp_path,
     assert runs.train(runs.Run.open(folder), resume=True) is runs.End.BUDGET
     for name, leaf in leaves(trained).items():
         np.testing.assert_array_equal(leaves(folder)[name], leaf, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("falls", "speed", "demonstration", "expected"),
+    [
+        (0, 0.6, 0.8, 0.75),
+        (0, 1.0, 0.8, 0.75),  # too fast by as much
+        (5, 0.8, 0.8, 0.5),
+        (0, 2.0, 0.8, 0.0),
+        (0, -0.5, 0.8, 0.0),
+        (0, np.nan, 0.8, 0.0),
+        (0, 0.0, 0.0, 1.0),  # a demonstration that stands
+    ],
+)
+def test_quality(falls, speed, demonstration, expected):
+    names = [f.name for f in dataclasses.fields(Evaluation) if f.name != "motions"]
+    nothing = dict.fromkeys(names, 0.0)
+    known = {"episodes": 10, "falls": falls, "late_speed": speed, "demonstration_speed": demonstration}
+    assert Evaluation(**nothing | known).quality == pytest.approx(expected)
