@@ -1,8 +1,6 @@
 """The command line: ``fmpjax train``, ``evaluate``, ``render``, ``export``, ``report``, ``motion``, ``config``."""
 
-import contextlib
 import dataclasses
-import io
 import os
 import sys
 import warnings
@@ -262,10 +260,10 @@ class ShowConfig:
 
 
 def _runs():
-    """`fmpjax.runs`, imported when a command needs it, without MJX's word on stdout that Warp is not installed."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        from fmpjax import runs
+    """`fmpjax.runs`, imported when a command needs it."""
     import jax
+
+    from fmpjax import runs
 
     try:
         jax.devices()

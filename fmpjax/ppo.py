@@ -4,15 +4,19 @@ Networks, the action distribution and the running observation statistics are Bra
 TD(lambda) returns first and then improves the actor, each for its own number of epochs.
 """
 
+import contextlib
+import io
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training import distribution, networks
-from brax.training.acme import running_statistics
-from brax.training.types import UInt64
 from flax import linen
+
+with contextlib.redirect_stdout(io.StringIO()):  # where MJX, which Brax imports, says that Warp is not installed
+    from brax.training import distribution, networks
+    from brax.training.acme import running_statistics
+    from brax.training.types import UInt64
 
 from fmpjax import sharding
 from fmpjax.config import PPOConfig

@@ -112,7 +112,7 @@ def test_two_processes_are_one(tmp_path):
         address = f"localhost:{free.getsockname()[1]}"
     common = ["train", "--preset", "smoke", *settings(TINY | {"transitions": 8 * 8 * 4, "evaluations": (1.0,)})]
     joined = ["--run", tmp_path / "two", "--distributed", "--coordinator", address, "--processes", 2]
-    flags = "import os; os.environ['XLA_FLAGS'] = '--xla_force_host_platform_device_count={}'; "
+    flags = "import os; os.environ['XLA_FLAGS'] += ' --xla_force_host_platform_device_count={}'; "
     main = "import sys; from fmpjax.cli import main; main(sys.argv[1:])"
 
     def start(devices, *arguments):
