@@ -372,9 +372,9 @@ def test_report_without_results(tmp_path, capsys):
 def test_matched_comparison_in_the_report():
     """Claims follow the last evaluation of each cell; those without a side are left out."""
 
-    def evaluation(method, speed, transitions=2, falls=0.0):
+    def evaluation(method, speed, transitions=2, falls=0.0, reset="dataset"):
         figures = {"late_speed": speed, "falls": falls, "excursion": None, "demonstration_speed": 0.8}
-        cell = {"cell": method, "method": method, "reset": "dataset", "variant": "", "seed": 0, "seconds": 1.0}
+        cell = {"cell": method, "method": method, "reset": reset, "variant": "", "seed": 0, "seconds": 1.0}
         return cell | {"transitions": transitions} | figures
 
     final = table.final([evaluation("fmp", 0.1, 1), evaluation("fmp", 0.7), evaluation("amp", 0.5)])
@@ -383,3 +383,9 @@ def test_matched_comparison_in_the_report():
     final = table.final([evaluation("fmp", 0.7, falls=9.0), evaluation("amp", 0.75)])
     assert [v.holds for v in table.verdicts(final)] == [False, False]
     assert len(table.verdicts(final[:1])) == 1
+    # Where everybody falls within five seconds there is no late speed.
+    walks, falls = evaluation("fmp", 0.7, reset="fixed"), evaluation("endpoint", None, falls=100.0, reset="fixed")
+    (verdict,) = table.verdicts(table.final([walks, falls]))
+    assert verdict.holds and verdict.found.endswith("100.0 % and no one after 5 s (Endpoint)")
+    (verdict,) = table.verdicts(table.final([walks | {"late_speed": None, "falls": 100.0}, falls]))
+    assert not verdict.holds
