@@ -231,10 +231,10 @@ class Env:
         return self._advance(sim, action)[:3]
 
     def _advance(self, sim, action):
-        sim = sharding.per_device(self.physics.step)(sim, self.actions(action))
-        finite = _finite(sim)
-        # Non-finite numbers must not reach the observation, not even to be discarded.
-        sim = jax.tree.map(lambda x: jnp.where(finite[:, None], x, 0.0), sim)
+        reached = sharding.per_device(self.physics.step)(sim, self.actions(action))
+        finite = _finite(reached)
+        # Non-finite numbers must not reach the observation, not even to be discarded: the state before stays.
+        sim = jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), reached, sim)
         observed = self._observe(sim.qpos, sim.qvel)
         return sim, observed, observed.fallen | ~finite, finite
 

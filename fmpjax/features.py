@@ -4,7 +4,8 @@ Sizes follow from the robot. For the G1 the full forms are 237 numbers for the a
 frames for the prior. Most of a frame's joint rotations repeat each other: a hinge about y turns six coordinates of
 which two are constant and four are its sine and cosine, twice each. The program therefore keeps *compact frames* (117
 numbers for 29 hinges) and gives the doubled coordinates the weight sqrt(2), which leaves every distance between windows
-what it was.
+what it was, and so what SGD does to a first layer. Adam, which moves every weight alike, moves a doubled coordinate's
+share of a sum 1/sqrt(2) as fast as it would move the two.
 """
 
 from typing import NamedTuple
@@ -243,6 +244,10 @@ class FeatureMap(NamedTuple):
         z = (_placed(frames, self.planar) - self.mean) / self.deviation
         x = jnp.clip(z, -self.clip, self.clip) * self.weight
         return x.reshape(*x.shape[:-2], -1)
+
+    def unclipped(self) -> "FeatureMap":
+        """The same map without the clip, for a prior that normalises and clips by itself."""
+        return self._replace(clip=jnp.float32(jnp.inf))
 
 
 def fit_feature_map(

@@ -53,7 +53,10 @@ class PPO:
         self.config = config
         self.observation_size, self.action_size = observation_size, action_size
         activation = getattr(linen, config.activation)
-        kernel = jax.nn.initializers.orthogonal(2.0**0.5) if config.orthogonal else jax.nn.initializers.lecun_uniform()
+        initializers = jax.nn.initializers
+        # Otherwise uniform within 1 / sqrt(inputs), PyTorch's way.
+        uniform = initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+        kernel = initializers.orthogonal(2.0**0.5) if config.orthogonal else uniform
 
         def normalize(observation, statistics):
             return running_statistics.normalize(observation, statistics, max_abs_value=config.normalizer_clip)

@@ -46,8 +46,9 @@ class Trainer:
         self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo)
         windows, share = self.env.clip_windows(), self.library.window_share(self.env.horizon)
         self.feature_map = features.fit_feature_map(self.robot, windows, config.features, share)
+        self.prior_map = self.feature_map.unclipped() if priors.normalizes(config.method) else self.feature_map
         self.expert = priors.Expert(
-            windows=self.feature_map(windows),
+            windows=self.prior_map(windows),
             dimension=float(self.feature_map.dimension),
             weight=jnp.tile(self.feature_map.weight, self.env.horizon),
             horizon=self.env.horizon,
@@ -87,7 +88,7 @@ class Trainer:
         key, rollout_key, prior_key, ppo_key = jax.random.split(state.key, 4)
         env, steps = self.env.rollout(state.env, self.ppo.act(state.ppo), rollout_key, self.config.ppo.rollout_steps)
         # Devices split the windows as the prior does, by rows of the rollout: indices travel, windows do not.
-        windows = self.feature_map(self.env.frame_table(state.env, steps)[sharding.gather(steps.window)])
+        windows = self.prior_map(self.env.frame_table(state.env, steps)[sharding.gather(steps.window)])
         prior, reward, prior_metrics = self.prior.update(
             state.prior, priors.Rollout(windows, ~steps.nonfinite), prior_key
         )

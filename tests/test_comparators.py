@@ -96,6 +96,17 @@ def test_nested_ablations_differ_in_nothing_but_a_loss(cloud):
         assert max(map(float, jax.tree.leaves(moved))) > 1e-3
 
 
+def test_scalar_methods_share_one_expert_bank(cloud):
+    """Windows that a bank of 8 does not exhaust, so that two draws differ."""
+    expert, _ = cloud
+    config = dataclasses.replace(SMALL, prior=dataclasses.replace(SMALL.prior, bank=8))
+    for seed in range(3):
+        key = jax.random.PRNGKey(seed)
+        banks = [priors.make(m, expert, config).init(key).bank for m in ("fmp", "endpoint", "value", "bank16")]
+        for bank in banks[1:]:
+            np.testing.assert_array_equal(bank, banks[0])
+
+
 # --- 16-bank score ---------------------------------------------------------------------------------------------------
 
 
@@ -204,7 +215,7 @@ def test_amp_loss_by_hand():
     penalty 0.01 * 4 = 0.04. Sum 41.760095.
     """
     params = {"params": {"logit": {"kernel": jnp.array([[2.0]]), "bias": jnp.zeros(1)}}}
-    network = amp.Discriminator((), 1.0)
+    network = amp.Discriminator((), 1.0, 1.0)
     total, stats = amp.loss(network.apply, params, jnp.array([[0.5]]), jnp.array([[-1.0]]), AMPConfig())
     assert float(total) == pytest.approx(41.760095, rel=1e-6)
     assert float(stats["discriminator_loss"]) == pytest.approx(1.720095, rel=1e-6)
@@ -262,6 +273,26 @@ def test_amp_scores_before_it_fits(cloud):
         np.testing.assert_allclose(reward.ravel(), before, rtol=1e-5)
         assert np.abs(np.asarray(after - before)).max() > 1e-3
         state = new
+
+
+def test_amp_fits_with_the_normaliser_that_scored():
+    """One window everywhere on either side: whatever is drawn, the first update's loss is that of the initial state."""
+    expert = expert_of(np.full((32, 3), 0.7))
+    points = np.full((STEPS * COUNT, 3), -0.4)
+    config = dataclasses.replace(SMALL, amp=dataclasses.replace(SMALL.amp, updates=1))
+    prior = amp.make(expert, config)
+    state = prior.init(jax.random.PRNGKey(0))
+    _, _, metrics = prior.update(state, rollout_of(points), jax.random.PRNGKey(1))
+    agent, demonstration = (float(prior.score(state, jnp.full((1, 3), x, jnp.float32))[0]) for x in (-0.4, 0.7))
+    expected = 0.5 * (np.log1p(np.exp(agent)) + np.log1p(np.exp(-demonstration)))
+    assert float(metrics["discriminator_loss"]) == pytest.approx(expected, rel=1e-3)  # replayed in half precision
+    assert float(metrics["replayed"]) == STEPS * COUNT
+
+
+def test_amp_first_layer_starts_within_the_full_windows_scale():
+    expert = expert_of(np.zeros((4, 30)))._replace(dimension=90.0)
+    kernel = np.asarray(amp.make(expert, SMALL).init(jax.random.PRNGKey(0)).params["params"]["Dense_0"]["kernel"])
+    assert 0.9 * 90**-0.5 < np.abs(kernel).max() <= 90**-0.5
 
 
 def test_amp_reward_rises_toward_the_demonstration():

@@ -390,6 +390,8 @@ def test_every_kind_of_blow_up_is_contained_and_its_state_is_kept():
         np.testing.assert_array_equal(one[:2], two[:2])
     for leaf in jax.tree.leaves((struck.states[-1], b, built.frame_table(start, struck.records[0]))):
         assert np.isfinite(np.asarray(leaf, np.float64)).all()
+    # What is recorded of a blow-up is the state before it.
+    np.testing.assert_array_equal(b.frame[2, :4], b.frame[1, :4])
     # The state before the first one's blow-up, and its action, are kept to be looked at.
     offender = struck.states[-1].offender
     np.testing.assert_array_equal(offender.action, b.action[2, 0])

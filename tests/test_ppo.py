@@ -70,6 +70,20 @@ def batch_of(ppo, state, key, env):
     )
 
 
+def test_hidden_layers_start_as_pytorch_starts_them():
+    """Uniform within 1 / sqrt(inputs), biases zero; the mean's weights within their own bound."""
+    ppo = PPO(25, 3, dataclasses.replace(PPOConfig(), hidden=(256, 64)))
+    state = ppo.init(jax.random.PRNGKey(0))
+    for params in (state.actor, state.critic):
+        layers = [p for p in jax.tree.leaves(params) if p.ndim == 2]
+        for inputs in (25, 256):
+            (kernel,) = (p for p in layers if p.shape[0] == inputs)
+            assert 0.97 * inputs**-0.5 < float(jnp.abs(kernel).max()) <= inputs**-0.5
+        last = 0.01 if params is state.actor else 64**-0.5
+        (kernel,) = (p for p in layers if p.shape[0] == 64)
+        assert 0.5 * last < float(jnp.abs(kernel).max()) <= last
+
+
 @functools.cache
 def make(**changes):
     """PPO, its state at the start, and its compiled update."""

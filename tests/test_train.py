@@ -344,6 +344,20 @@ def test_a_configuration_survives_its_file():
 
 
 @pytest.mark.slow
+def test_a_prior_that_normalises_by_itself_sees_windows_unclipped(walk):
+    fmp, amp = (Trainer(tiny(method=method), walk) for method in ("fmp", "amp"))
+    far = fmp.env.clip_windows() + 100.0
+
+    def farthest(feature_map):
+        return float(jnp.abs(feature_map(far) / fmp.expert.weight).max())
+
+    assert farthest(fmp.prior_map) == pytest.approx(10.0)
+    assert farthest(amp.prior_map) > 100.0
+    # What evaluations measure in is the same for every method.
+    assert farthest(amp.feature_map) == pytest.approx(10.0)
+
+
+@pytest.mark.slow
 def test_seeds_decide_the_start(trainer):
     def flat(state):
         return np.concatenate([np.asarray(x, np.float64).ravel() for x in jax.tree.leaves(state)])

@@ -121,9 +121,10 @@ def fit(
       The fits by name, and the machine's rate for matrix products in between, FLOP/s.
     """
     block = min(BLOCK, updates)
-    config = dataclasses.replace(
-        config, prior=dataclasses.replace(config.prior, updates=block, query_share=QUERY_SHARE, query_is_bank=False)
+    prior = dataclasses.replace(
+        config.prior, updates=block, query_share=QUERY_SHARE, query_is_bank=False, average_restarts=True
     )
+    config = dataclasses.replace(config, prior=prior)
     init_key, key = jax.random.split(key)
     made = {name: MAKERS[name](expert, config) for name in names}
     states = {name: prior.init(init_key) for name, prior in made.items()}

@@ -51,7 +51,7 @@ def copies(trainer: Trainer, seed: int = 0) -> dict[str, np.ndarray]:
         "shuffled in time": np.take_along_axis(demonstration, order[..., None], axis=1),
         "noisy (0.1 rad, 1 rad/s)": windows(noisy_qpos, noisy_qvel),
     }
-    return {name: np.asarray(trainer.feature_map(jnp.asarray(value))) for name, value in rows.items()}
+    return {name: np.asarray(trainer.prior_map(jnp.asarray(value))) for name, value in rows.items()}
 
 
 def _frames(trainer: Trainer, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy import stats
 
+from fmpjax.config import FeatureConfig
 from fmpjax.experiments import results
 from fmpjax.experiments.cells import Cell
 from fmpjax.experiments.results import Verdict
@@ -207,10 +208,23 @@ def write(cells: Sequence[Cell], folder: Path, places: Iterable[Path | str] = ()
     # The cells may have been trained by other versions than the one that writes this.
     runs = {cell.name: _origin(folder / cell.name / "provenance.json") for cell in cells}
     results.save(folder, "results", {"runs": runs, "evaluations": flat}, flat, {folder, *places, *motions})
-    (folder / "table.md").write_text(markdown(final) + "\n")
+    (folder / "table.md").write_text("\n\n".join([markdown(final), *_cautions(cells)]) + "\n")
     (folder / "table.tex").write_text(latex(final) + "\n")
     curves(rows, [folder / "curves.png", folder / "curves.pdf"])
     return [folder / n for n in ("results.csv", "results.json", "table.md", "table.tex", "curves.png", "curves.pdf")]
+
+
+def _cautions(cells: Sequence[Cell]) -> list[str]:
+    """What the table's reader must know of its columns."""
+    paper = FeatureConfig()
+    floors = {(c.config.features.deviation_floor, c.config.features.angular_velocity_floor) for c in cells}
+    others = floors - {(paper.deviation_floor, paper.angular_velocity_floor)}
+    return [
+        f"Sinkhorn discrepancies are in the run's own features, whose deviations are floored at {floor:g}, those of "
+        f"angular velocities at {angular:g} rad/s (preset `paper`: {paper.deviation_floor:g}). The paper's figures in "
+        "that column stand in other units."
+        for floor, angular in sorted(others)
+    ]
 
 
 def _origin(path: Path) -> dict[str, Any]:

@@ -14,6 +14,7 @@ _REGISTRY = {
     "amp": amp.make,
 }
 METHODS = tuple(_REGISTRY)
+_OWN_NORMALIZER = ("amp",)
 
 
 def make(method: str, expert: Expert, config: Config) -> MotionPrior:
@@ -26,10 +27,26 @@ def make(method: str, expert: Expert, config: Config) -> MotionPrior:
     return _REGISTRY[method](expert, config)
 
 
+def normalizes(method: str) -> bool:
+    """Whether the prior called ``method`` normalises windows itself, and so takes them unclipped."""
+    return method in _OWN_NORMALIZER
+
+
 def check(method: str) -> None:
     """Raise a `UserError` unless ``method`` names a prior."""
     if method not in _REGISTRY:
         raise UserError(f"unknown method {method!r}: expected one of {', '.join(_REGISTRY)}")
 
 
-__all__ = ["METHODS", "Expert", "MotionPrior", "Reward", "Rollout", "check", "couple", "make", "median_reward"]
+__all__ = [
+    "METHODS",
+    "Expert",
+    "MotionPrior",
+    "Reward",
+    "Rollout",
+    "check",
+    "couple",
+    "make",
+    "median_reward",
+    "normalizes",
+]

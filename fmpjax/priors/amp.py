@@ -26,7 +26,7 @@ class Normalizer(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """Windows of earlier rollouts in half precision: relative error 5e-4 on clipped features, half the memory."""
+    """Windows of earlier rollouts in half precision: relative error 5e-4, half the memory."""
 
     windows: jax.Array  # [R, D] float16
     head: jax.Array  # scalar int32, where the next window goes
@@ -43,21 +43,26 @@ class AMPState(NamedTuple):
 
 
 class Discriminator(linen.Module):
-    """Logit ``[n]`` of normalised windows ``[n, D]``; positive means demonstration."""
+    """Logit ``[n]`` of normalised windows ``[n, D]``; positive means demonstration.
+
+    Weights start uniform within 1 / sqrt(inputs), of the first layer those of the full window.
+    """
 
     hidden: tuple[int, ...]
     logit_init: float
+    dimension: float  # d, coordinates of the full window
 
     @linen.compact
     def __call__(self, x):
+        inputs = self.dimension
         for width in self.hidden:
-            x = linen.relu(linen.Dense(width)(x))
-        bound = self.logit_init
+            x = linen.relu(linen.Dense(width, kernel_init=_uniform(1 / math.sqrt(inputs)))(x))
+            inputs = width
+        return linen.Dense(1, kernel_init=_uniform(self.logit_init), name="logit")(x)[..., 0]
 
-        def uniform(key, shape, dtype=jnp.float32):
-            return jax.random.uniform(key, shape, dtype, -bound, bound)
 
-        return linen.Dense(1, kernel_init=uniform, name="logit")(x)[..., 0]
+def _uniform(bound: float):
+    return lambda key, shape, dtype=jnp.float32: jax.random.uniform(key, shape, dtype, -bound, bound)
 
 
 def cap(config: AMPConfig) -> float:
@@ -126,7 +131,7 @@ def loss(apply, params, agent: jax.Array, demonstration: jax.Array, config: AMPC
 def make(expert: Expert, config: Config) -> MotionPrior:
     """AMP against all windows of the demonstration."""
     settings = config.amp
-    network = Discriminator(settings.hidden, settings.logit_init)
+    network = Discriminator(settings.hidden, settings.logit_init, expert.dimension)
     size = expert.windows.shape[-1]
     if settings.optimizer == "adam":
         direction = optax.scale_by_adam()
@@ -155,27 +160,23 @@ def make(expert: Expert, config: Config) -> MotionPrior:
 
     def update(state: AMPState, rollout: Rollout, key):
         pool = flatten(rollout, expert.windows[0])
-        order_key, expert_key, replay_key, store_key = jax.random.split(key, 4)
+        order_key, seen_key, replay_key, store_key = jax.random.split(key, 4)
         logits = score(state, pool)
         reward = reward_of(logits, settings).reshape(rollout.valid.shape)
         reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
 
-        seen = expert.draw(expert_key, (len(pool),))
-        normalizer = update_normalizer(state.normalizer, pool / expert.weight, seen / expert.weight)
+        replay = store(state.replay, pool, settings.replay_new, store_key)
 
         def step(carry, inputs):
             params, optimizer_state = carry
             rows, key = inputs
             agent_key, expert_key = jax.random.split(key)
             current = sharding.split(pool[rows])
-            held = state.replay.count
-            old = state.replay.windows[jax.random.randint(agent_key, rows.shape, 0, jnp.maximum(held, 1))]
-            # The first rollout has nothing behind it: it is its own past.
-            old = jnp.where(held > 0, old.astype(pool.dtype), current)
-            agent = normalize(normalizer, jnp.concatenate([current, old]))
-            demonstration = expert.draw(expert_key, rows.shape)
+            old = replay.windows[jax.random.randint(agent_key, rows.shape, 0, replay.count)].astype(pool.dtype)
+            agent = normalize(state.normalizer, jnp.concatenate([current, old]))
+            demonstration = normalize(state.normalizer, expert.draw(expert_key, rows.shape))
             (total, stats), gradients = jax.value_and_grad(
-                lambda p: loss(network.apply, p, agent, normalize(normalizer, demonstration), settings), has_aux=True
+                lambda p: loss(network.apply, p, agent, demonstration, settings), has_aux=True
             )(params)
             updates, new_optimizer_state = optimizer.update(gradients, optimizer_state, params)
             finite = jnp.isfinite(total) & jnp.isfinite(optax.global_norm(gradients))
@@ -191,7 +192,9 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         (params, optimizer_state), stats = jax.lax.scan(
             step, (state.params, state.optimizer), (rows, jax.random.split(replay_key, settings.updates))
         )
-        replay = store(state.replay, pool, settings.replay_new, store_key)
+        # What scored and was fitted saw one normaliser; the next rollout is scored with the next.
+        seen = expert.draw(seen_key, (len(pool),))
+        normalizer = update_normalizer(state.normalizer, pool / expert.weight, seen / expert.weight)
         low, middle, high = jnp.quantile(logits, jnp.array([0.25, 0.5, 0.75]))
         summary = {name: values.mean() for name, values in stats.items()}
         summary |= {

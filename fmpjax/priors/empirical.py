@@ -28,11 +28,12 @@ def make(expert: Expert, config: Config) -> MotionPrior:
     settings, windows = config.prior, expert.windows
 
     def init(key):
+        bank_key, _ = jax.random.split(key)  # FMP's bank
         # Source banks of one window of the demonstration, until there is a rollout.
         count, size = settings.score_banks, settings.bank
         source = jnp.broadcast_to(windows[0], (count, size, windows.shape[-1]))
         zeros = jnp.zeros((count, size))
-        return EmpiricalState(expert.bank_rows(key, size), source, zeros, zeros, jnp.ones(count))
+        return EmpiricalState(expert.bank_rows(bank_key, size), source, zeros, zeros, jnp.ones(count))
 
     def score(state: EmpiricalState, x):
         to_expert = transport.squared_cost(x, windows[state.bank])  # in every source bank's score
