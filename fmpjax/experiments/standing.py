@@ -3,7 +3,7 @@
 A policy is trained as `fmpjax train` would, and every so often it is halted and looked at: what its standing and its
 walking moments earn and how soon they end in a fall, how much of the policy gradient is about survival alone, how well
 the few updates of a rollout follow the transport they are fitted to, and which features carry the score. Run as
-``python -m fmpjax.experiments.standing measure --out FOLDER``.
+``python -m fmpjax.experiments.standing measure --out FOLDER``; ``look --run RUN`` looks at a run's newest state only.
 """
 
 import csv
@@ -11,6 +11,7 @@ import dataclasses
 import json
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -234,8 +235,54 @@ def _teachers(pool, expert, query, truth, dimension, config, key) -> dict[str, j
         teacher = flow.teach(coupling, expert, at)
         row[f"teacher_{name}_correlation"] = reference.correlation(teacher.score, true.score)
         row[f"teacher_{name}_gradient_cosine"] = reference.cosine(teacher.gradient, true.gradient)
+        lengths = (jnp.linalg.norm(gradient, axis=-1).mean() for gradient in (teacher.gradient, true.gradient))
+        row[f"teacher_{name}_gradient_length"], row[f"true_{name}_gradient_length"] = lengths
         row[f"teacher_{name}_own_share"] = teacher.to_source.max(-1).mean()  # of the nearest source window
     return row
+
+
+@partial(jax.jit, static_argnums=0)
+def _examine(trainer: Trainer, state: TrainState, key: jax.Array) -> tuple[Moments, dict[str, jax.Array]]:
+    gather_key, fit_key = jax.random.split(key)
+    moments = gather(trainer, state, gather_key)
+    rest = gradients(trainer, state, moments) | fits(trainer, state, moments, fit_key)
+    return moments._replace(windows=jnp.zeros(0), pushed=jnp.zeros(0)), rest
+
+
+def examine(trainer: Trainer, state: TrainState, seed: int) -> dict[str, float]:
+    """All figures of one state: behaviours, gradients, fits."""
+    done = int(state.iteration) * trainer.config.transitions_per_iteration
+    moments, rest = _examine(trainer, state, jax.random.fold_in(jax.random.PRNGKey(seed), done))
+    row = {"transitions": done, "cap": float(state.env.cap), "speed": float(moments.speed.mean())}
+    return row | behaviours(moments) | {name: float(value) for name, value in rest.items()}
+
+
+def _write(path: Path, rows: list[dict[str, float]]) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows({k: v if isinstance(v, str) else f"{v:.6g}" for k, v in row.items()} for row in rows)
+
+
+def look(run: tuple[Path, ...], out: Path) -> None:
+    """Look at the newest state of runs.
+
+    Args:
+      run: one folder or several.
+      out: CSV file to write, a line a run.
+    """
+    rows = []
+    for folder in run:
+        opened = runs.Run.open(folder)
+        if opened.config.method not in ("fmp", "endpoint", "value"):
+            raise UserError(f"run {folder} is of method {opened.config.method!r}: expected fmp, endpoint or value")
+        trainer, state = opened.policy(best=False)
+        print(f"{folder}: compiling ...", flush=True)
+        row = examine(trainer, state, trainer.config.seed)
+        rows.append({"run": f"{folder.parent.name}/{folder.name}"} | row)
+        print("\n".join(f"  {name:<32} {value:.4g}" for name, value in row.items()), flush=True)
+    _write(out, rows)
+    print(f"wrote {out}")
 
 
 def track(trainer: Trainer) -> dict[str, float]:
@@ -303,14 +350,6 @@ def measure(
     print("tracking: " + ", ".join(f"{k} {v if isinstance(v, str) else round(v, 4)}" for k, v in tracking.items()))
     state = trainer.init()
 
-    @jax.jit
-    def look(state: TrainState, key):
-        gather_key, fit_key = jax.random.split(key)
-        moments = gather(trainer, state, gather_key)
-        rest = gradients(trainer, state, moments) | fits(trainer, state, moments, fit_key)
-        small = moments._replace(windows=jnp.zeros(0), pushed=jnp.zeros(0))
-        return small, rest
-
     print("compiling ...", flush=True)
     chunk = trainer.compile(state)
     rows, due = [], every
@@ -321,9 +360,7 @@ def measure(
             continue
         due += every
         began = time.monotonic()
-        moments, rest = look(state, jax.random.fold_in(jax.random.PRNGKey(seed), done))
-        row = {"transitions": done, "cap": float(state.env.cap), "speed": float(moments.speed.mean())}
-        row |= behaviours(moments) | {name: float(value) for name, value in rest.items()}
+        row = examine(trainer, state, seed)
         row |= {"deviation": float(metrics["ppo/deviation"]), "expert_margin": float(metrics["fit/expert_margin"])}
         rows.append(row)
         print(
@@ -334,10 +371,7 @@ def measure(
             f"{time.monotonic() - began:.0f} s",
             flush=True,
         )
-        with (out / "standing.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0])
-            writer.writeheader()
-            writer.writerows({k: f"{v:.6g}" for k, v in r.items()} for r in rows)
+        _write(out / "standing.csv", rows)
     settings = {"preset": preset_name, "motion": Path(motion).name, "frames": frames, "seed": seed, "set": changes}
     evaluation = json.loads(Evaluator(trainer)(state.ppo).to_json())
     record = {"settings": settings, "tracking": tracking, "evaluation": evaluation, "provenance": runs.provenance()}
@@ -358,7 +392,7 @@ def figure(out: Path, runs: tuple[Path, ...]) -> Path:
 
 if __name__ == "__main__":
     try:
-        tyro.extras.subcommand_cli_from_dict({"measure": measure, "figure": figure})
+        tyro.extras.subcommand_cli_from_dict({"measure": measure, "look": look, "figure": figure})
     except UserError as error:
         print(f"fmpjax: {error}", file=sys.stderr)
         sys.exit(2)
