@@ -183,13 +183,15 @@ class Retarget:
     """Motion capture, .bvh."""
     out: Path
     """File to write, .npz."""
+    frames: str | None = None
+    """Frames first:last of the file, 0-based, both included."""
     robot: str = "unitree_g1"
     """A robot under robots/."""
 
     def __call__(self) -> None:
         from fmpjax.motion import retarget
 
-        print(retarget.convert(self.file, robots.load(self.robot), self.out))
+        print(retarget.convert(self.file, robots.load(self.robot), self.out, self.frames))
 
 
 COMMANDS = {

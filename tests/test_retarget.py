@@ -253,7 +253,14 @@ def test_command(robot, second, tmp_path, capsys):
     cli.main(command)
     assert f"wrote {out}: {len(second)} frames at 30 Hz, 0.01 m per unit of the file" in capsys.readouterr().out
     assert motion.load(out, rate=30.0).qpos.shape == second.qpos.shape
+    cli.main([*command, "--frames", "5:24"])
+    assert "20 frames at 30 Hz" in capsys.readouterr().out
+    assert len(motion.load(out, rate=30.0)) == 20
     out.unlink()
+    with pytest.raises(SystemExit) as caught:
+        cli.main([*command, "--frames", f"5:{len(second)}"])
+    assert caught.value.code == 2
+    assert f"frames 5:{len(second)} are outside the file" in capsys.readouterr().err
     path.write_text("HIERARCHY\n")
     with pytest.raises(SystemExit) as caught:
         cli.main(command)

@@ -71,16 +71,25 @@ def record(
 ) -> tuple[Path, Recording]:
     """The file of a motion and its rows as they are, at their own rate; arguments and errors as of `load`."""
     _check_rate("fps", fps)
-    span = _parse_frames(frames)
     loaded = robots.load(robot)
     file = locate(path, robot)
     qpos, rate = readers.read(file, loaded)
-    if span is not None:
-        first, last = span
-        if last >= len(qpos):
-            raise UserError(f"{file}: frames {first}:{last} are outside the file, which has rows 0:{len(qpos) - 1}")
-        qpos = qpos[first : last + 1]
-    return file, Recording(qpos, rate if fps is None else float(fps))
+    return file, Recording(cut(file, qpos, frames), rate if fps is None else float(fps))
+
+
+def cut(file: Path, rows: np.ndarray, frames: tuple[int, int] | str | None) -> np.ndarray:
+    """The ``frames`` of a file's ``rows [T, ...]``, first to last, both included; all where None.
+
+    Raises:
+      UserError: the frames are not two row numbers of the file, in order.
+    """
+    span = _parse_frames(frames)
+    if span is None:
+        return rows
+    first, last = span
+    if last >= len(rows):
+        raise UserError(f"{file}: frames {first}:{last} are outside the file, which has rows 0:{len(rows) - 1}")
+    return rows[first : last + 1]
 
 
 def save(clip: MotionClip, path: str | os.PathLike) -> Path:

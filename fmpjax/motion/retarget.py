@@ -24,7 +24,7 @@ from fmpjax.errors import UserError
 from fmpjax.motion import bvh
 from fmpjax.motion.bvh import Bvh
 from fmpjax.motion.clip import MotionClip
-from fmpjax.motion.formats import save
+from fmpjax.motion.formats import cut, save
 from fmpjax.robots import Robot
 
 SIDES = ("left", "right")
@@ -125,14 +125,15 @@ def retarget(source: Bvh, robot: Robot, name: str) -> Retargeted:
     return Retargeted(MotionClip.from_qpos(name, robot.name, rate, qpos), residual, targets.contact, scale)
 
 
-def convert(file: str | os.PathLike, robot: Robot, out: str | os.PathLike) -> str:
-    """Retarget the BVH ``file`` and write the clip as ``out``; says in a few words how it fits.
+def convert(file: str | os.PathLike, robot: Robot, out: str | os.PathLike, frames: str | None = None) -> str:
+    """Retarget the BVH ``file``, or its ``frames`` FIRST:LAST, and write the clip as ``out``; says how it fits.
 
     Raises:
-      UserError: see `bvh.read`, `retarget` and `fmpjax.motion.save`.
+      UserError: see `bvh.read`, `formats.cut`, `retarget` and `fmpjax.motion.save`.
     """
     file = Path(file)
-    done = retarget(bvh.read(file), robot, file.stem)
+    source = bvh.read(file)
+    done = retarget(source._replace(values=cut(file, source.values, frames)), robot, file.stem)
     save(done.clip, out)
     return (
         f"wrote {out}: {len(done.clip)} frames at {done.clip.rate:g} Hz, {done.scale:.4g} m per unit of the file, "
