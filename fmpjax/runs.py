@@ -104,6 +104,13 @@ class Run:
         write(self.folder / "config.json", configuration.to_json(longer))
         self._trainer = None
 
+    def resumed(self) -> None:
+        """Say in the provenance that this process goes on with the run."""
+        path, here = self.folder / "provenance.json", provenance()
+        made = json.loads(path.read_text())
+        again = {key: here[key] for key in ("command", "date", "commit", "uncommitted_changes", "device")}
+        write(path, json.dumps(made | {"resumed": [*made.get("resumed", []), again]}, indent=1))
+
     def trainer(self) -> Trainer:
         """The run's parts."""
         if self._trainer is None:
@@ -171,6 +178,9 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
     if done >= config.iterations:
         progress.note(f"the budget of {config.transitions:,} transitions is spent: a larger --transitions would go on")
         return End.BUDGET
+    if done and primary:
+        for run in group:
+            run.resumed()
     progress.note(f"{trainer.env.physics.name} physics on {machine()}; compiling, which takes a minute or so ...")
     compile_began = time.monotonic()
     state = states[0] if len(group) == 1 else stack(states)
@@ -326,7 +336,8 @@ def export(run: Run, out: Path) -> list[Path]:
     """
     # Where the demonstration and the run lay is this machine's affair; their names are everybody's.
     texts = {n: (run.folder / n).read_text() for n in ("config.json", "provenance.json")}
-    for path in (*(name for name, _ in motion.library.parse(run.config.motion)), str(run.folder)):
+    folders = str(run.folder.resolve()), str(run.folder)
+    for path in (*(name for name, _ in motion.library.parse(run.config.motion)), *folders):
         texts = {n: text.replace(path, Path(path).name) for n, text in texts.items()}
     if (out / "config.json").exists() and (out / "config.json").read_text() != texts["config.json"]:
         raise UserError(f"{out} holds results of another configuration: expected a new folder or this run's own")

@@ -204,6 +204,9 @@ def test_a_resume_in_a_new_process_is_exact(trained, stopped):
     for name, leaf in whole.items():
         np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
     assert int(whole[".iteration"]) == 10
+    made = json.loads((stopped / "provenance.json").read_text())
+    assert [part["command"] for part in made["resumed"]] == [f"fmpjax train --resume --run {stopped}"]
+    assert made["command"] != made["resumed"][0]["command"]
     # An evaluation is logged where time runs out; apart from it every row agrees to its last digit.
     for a, b in zip(rows(trained), rows(stopped), strict=True):
         differ = [k for k in a if a[k] != b[k] and not (k.startswith("eval/") and not a[k])]
