@@ -222,11 +222,10 @@ class Evaluator:
         pick = np.random.default_rng(0).permutation(len(steps))[:WINDOWS]
         rows = steps[pick, None] + 1 + np.arange(horizon)
         evaluated = trainer.feature_map(jnp.asarray(frames[rows, episodes[pick, None]]))
-        windows = trainer.env.clip_windows()
-        rows = np.arange(0, len(windows), max(1, len(windows) // WINDOWS))
+        rows = np.arange(0, len(trainer.expert.windows), max(1, len(trainer.expert.windows) // WINDOWS))
         if trainer.expert.share is not None:
             rows = trainer.expert.bank_rows(jax.random.PRNGKey(0), WINDOWS)
-        expert = trainer.feature_map(windows[rows])
+        expert = trainer.expert.windows[rows]
         return float(discrepancy(evaluated, expert, trainer.feature_map.dimension))
 
 

@@ -46,15 +46,17 @@ class Trainer:
         self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo)
         windows, share = self.env.clip_windows(), self.library.window_share(self.env.horizon)
         self.feature_map = features.fit_feature_map(self.robot, windows, config.features, share)
-        self.prior_map = self.feature_map.unclipped() if priors.normalizes(config.method) else self.feature_map
         self.expert = priors.Expert(
-            windows=self.prior_map(windows),
+            windows=self.feature_map(windows),
             dimension=float(self.feature_map.dimension),
             weight=jnp.tile(self.feature_map.weight, self.env.horizon),
             horizon=self.env.horizon,
             share=None if share is None else jnp.asarray(share, jnp.float32),
         )
-        self.prior = priors.make(config.method, self.expert, config)
+        # What windows are compared in is the same for every method; what its prior is given need not be.
+        self.prior_map = self.feature_map.unclipped() if priors.normalizes(config.method) else self.feature_map
+        self.prior_expert = self.expert._replace(windows=self.prior_map(windows))
+        self.prior = priors.make(config.method, self.prior_expert, config)
 
     @property
     def clip(self) -> MotionClip:

@@ -356,8 +356,10 @@ def test_a_prior_that_normalises_by_itself_sees_windows_unclipped(walk):
 
     assert farthest(fmp.prior_map) == pytest.approx(10.0)
     assert farthest(amp.prior_map) > 100.0
-    # What evaluations measure in is the same for every method.
+    np.testing.assert_array_equal(amp.prior_expert.windows, amp.prior_map(amp.env.clip_windows()))
+    # What evaluations and studies measure in is the same for every method.
     assert farthest(amp.feature_map) == pytest.approx(10.0)
+    np.testing.assert_array_equal(amp.expert.windows, fmp.expert.windows)
 
 
 @pytest.mark.slow

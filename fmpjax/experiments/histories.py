@@ -44,7 +44,13 @@ def _start(trainer: Trainer, key: jax.Array, count: int) -> EnvState:
 
 
 def pool(
-    trainer: Trainer, policy: PPOState, key: jax.Array, steps: int = 256, last: int = 32, count: int | None = None
+    trainer: Trainer,
+    policy: PPOState,
+    feature_map: FeatureMap,
+    key: jax.Array,
+    steps: int = 256,
+    last: int = 32,
+    count: int | None = None,
 ) -> Pool:
     """Windows of the last ``last`` of ``steps`` control steps in ``count`` environments, the run's own by default.
 
@@ -56,7 +62,7 @@ def pool(
         before = state
         state, record = play(state, chunk_key)
     speed = float(record.frame[..., features.velocity_index(trainer.robot)].mean())
-    return Pool(trainer.feature_map(trainer.env.frame_table(before, record)[record.window]), ~record.nonfinite, speed)
+    return Pool(feature_map(trainer.env.frame_table(before, record)[record.window]), ~record.nonfinite, speed)
 
 
 class Cohort(NamedTuple):

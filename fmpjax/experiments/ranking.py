@@ -70,7 +70,7 @@ def rank(trainer: Trainer, windows: jax.Array, key: jax.Array, updates: int = 51
     """
     config = trainer.config.prior
     changed = dataclasses.replace(trainer.config, prior=dataclasses.replace(config, updates=updates))
-    prior = priors.make(trainer.config.method, trainer.expert, changed)
+    prior = priors.make(trainer.config.method, trainer.prior_expert, changed)
     init_key, fit_key = jax.random.split(key)
     valid = jnp.ones(windows.shape[:2], bool)
     fit = jax.jit(prior.update)
@@ -120,7 +120,7 @@ def main(run: Path, start: bool = False, last: bool = False, updates: int = 512,
     else:
         trainer, state = opened.policy(best=not last)
         policy = state.ppo
-    played = histories.pool(trainer, policy, jax.random.PRNGKey(0), steps=32 if start else 256)
+    played = histories.pool(trainer, policy, trainer.prior_map, jax.random.PRNGKey(0), steps=32 if start else 256)
     ranking = rank(trainer, played.features, jax.random.PRNGKey(1), updates)
     print(f"pool: {played.valid.size} windows, mean forward speed {played.speed:.3f} m/s")
     print(table(ranking))

@@ -71,7 +71,7 @@ def gather(trainer: Trainer, state: TrainState, key: jax.Array) -> Moments:
         frames = env.frame_table(env_state, record)[record.window]
         # A faster window also comes from further back.
         faster = frames.at[..., forward].add(PUSH).at[..., :1].add(PUSH * lag)
-        windows = trainer.prior_map(frames), trainer.prior_map(faster)
+        windows = trainer.feature_map(frames), trainer.feature_map(faster)
         return after._replace(cap=env_state.cap), (*windows, frames[..., forward].mean(-1), record)
 
     _, (windows, pushed, speed, record) = jax.lax.scan(play, state.env, jax.random.split(key, ROLLOUTS))
