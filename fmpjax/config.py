@@ -35,6 +35,7 @@ class EnvConfig:
 
     count: int = 1024  # parallel environments [P]
     reset: str = "dataset"  # "dataset" (a demonstration state) or "fixed" (the default pose) [P]
+    reset_noise: float = 0.0  # rad, deviation of joint angles at a training reset; ten times that in rad/s [D: none]
     episode_steps: int = 500  # control steps, 10 s [P]
     first_cap: int = 500  # episode cap at the start; below episode_steps it grows as episodes survive [P: 500]
     last_cap: int = 500  # cap at which the growth ends; evaluation plays episode_steps all the same [D]
@@ -127,6 +128,7 @@ class PPOConfig:
     actor_batch: int = 4  # [M]
     discount: float = 0.99  # gamma [P]
     gae_lambda: float = 0.95  # [P]
+    fall_value: float = 0.0  # return from a fall on, in rewards [M: nothing]
     clip: float = 0.2  # probability-ratio clip [P]
     advantage_clip: float = 4.0  # normalised advantages are clipped to this magnitude [M]
     bound_penalty: float = 10.0  # weight of sum max(|mean| - 1, 0)^2 [M]
@@ -358,7 +360,7 @@ def validate(config: Config) -> Config:
     for key in _POSITIVE:
         if not flat[key] > 0:
             raise UserError(f"setting {key} is {flat[key]}: expected more than 0")
-    for key in ("prior.parallel_solves", "physics.threads"):
+    for key in ("prior.parallel_solves", "physics.threads", "env.reset_noise"):
         if flat[key] < 0:
             raise UserError(f"setting {key} is {flat[key]}: expected 0 or more")
     for key in ("ppo.discount", "ppo.gae_lambda", "prior.query_share"):

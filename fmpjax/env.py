@@ -140,14 +140,23 @@ class Env:
         before = rows[:, None] - np.arange(self.horizon)[::-1]
         return jnp.where(rows[:, None] == self.clip_rows, rows[:, None], before)
 
-    def start_at(self, rows: jax.Array) -> EnvState:
-        """Environments at the table rows ``[N]``, episodes beginning."""
-        table = jax.tree.map(jnp.asarray, self._table)
-        state = physics.reset(jnp.asarray(self._qpos)[rows], jnp.asarray(self._qvel)[rows])
+    def _begin(self, rows: jax.Array, key: jax.Array | None) -> tuple[physics.PhysicsState, Observed]:
+        """States at the table rows ``[N]`` and what is observed of them; with a key, joints are off by reset_noise."""
+        qpos, qvel = jnp.asarray(self._qpos)[rows], jnp.asarray(self._qvel)[rows]
+        noise = self.config.reset_noise
+        if key is None or not noise:
+            return physics.reset(qpos, qvel), jax.tree.map(lambda table: jnp.asarray(table)[rows], self._table)
+        angle, velocity = noise * jax.random.normal(key, (2, len(rows), self.robot.joint_count))
+        qpos, qvel = qpos.at[:, 7:].add(angle), qvel.at[:, 6:].add(10.0 * velocity)
+        return physics.reset(qpos, qvel), self._observe(qpos, qvel)
+
+    def start_at(self, rows: jax.Array, key: jax.Array | None = None) -> EnvState:
+        """Environments at the table rows ``[N]``, episodes beginning; exactly there unless a key is given."""
+        state, observed = self._begin(rows, key)
         return EnvState(
             physics=state,
-            observed=jax.tree.map(lambda x: x[rows], table),
-            history=table.frame[self.history_rows(rows)],
+            observed=observed,
+            history=jnp.asarray(self._table.frame)[self.history_rows(rows)],
             age=jnp.zeros(len(rows), jnp.int32),
             cap=jnp.float32(self.config.first_cap),
             capped_share=jnp.float32(0.0),
@@ -159,13 +168,11 @@ class Env:
 
     def reset(self, key: jax.Array) -> EnvState:
         """All environments at fresh resets."""
-        return self.start_at(self.reset_rows(key, self.config.count))
+        return self.start_at(self.reset_rows(key, self.config.count), jax.random.fold_in(key, 2))
 
     def rollout(self, state: EnvState, policy: PolicyFn, key: jax.Array, steps: int) -> tuple[EnvState, Steps]:
         """``steps`` control steps under a policy; falls and time-outs reset at once."""
         count = len(state.age)
-        table = jax.tree.map(jnp.asarray, self._table)
-        qpos, qvel = jnp.asarray(self._qpos), jnp.asarray(self._qvel)
         before = self.clip_rows + 1  # rows ahead of the frames before the rollout
         during = before + count * self.horizon  # rows ahead of the rollout's own frames
 
@@ -196,12 +203,12 @@ class Env:
             )
             done = fell | timed_out
             start = self.reset_rows(reset_key, count)
+            begun = self._begin(start, jax.random.fold_in(reset_key, 2))
 
             def choose(fresh, old):
                 return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), fresh, old)
 
-            sim = jax.tree.map(choose, physics.reset(qpos[start], qvel[start]), sim)
-            observed = jax.tree.map(lambda t, o: choose(t[start], o), table, reached)
+            sim, observed = jax.tree.map(choose, begun, (sim, reached))
             carry = (
                 sim,
                 observed,

@@ -136,7 +136,14 @@ class PPO:
         value = self.value(state, batch.observation)
         next_value = self.value(state, batch.next_observation)
         advantage = generalized_advantage(
-            batch.reward, value, next_value, batch.fell, batch.timed_out, config.discount, config.gae_lambda
+            batch.reward,
+            value,
+            next_value,
+            batch.fell,
+            batch.timed_out,
+            config.discount,
+            config.gae_lambda,
+            config.fall_value,
         )
         returns = advantage + value
         spread = jnp.maximum(advantage.std(), 1e-5)
@@ -235,13 +242,15 @@ class PPO:
         return params, optimizer_state, summary
 
 
-def generalized_advantage(reward, value, next_value, fell, timed_out, discount: float, gae_lambda: float):
+def generalized_advantage(
+    reward, value, next_value, fell, timed_out, discount: float, gae_lambda: float, fall_value: float = 0.0
+):
     """Advantages ``[T, N]``.
 
-    ``next_value`` is of the true next observation: a time-out bootstraps from it, a fall is worth nothing, and neither
-    lets the next episode's advantage leak in. Advantage plus value is the TD(lambda) return.
+    ``next_value`` is of the true next observation: a time-out bootstraps from it, a fall is worth ``fall_value``, and
+    neither lets the next episode's advantage leak in. Advantage plus value is the TD(lambda) return.
     """
-    delta = reward + discount * jnp.where(fell, 0.0, next_value) - value
+    delta = reward + discount * jnp.where(fell, fall_value, next_value) - value
     carry_on = discount * gae_lambda * (~(fell | timed_out))
 
     def backward(later, step):

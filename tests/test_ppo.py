@@ -188,6 +188,15 @@ def test_nothing_leaks_across_an_end():
         np.testing.assert_allclose(gain[4], 0.99 if how == "timed_out" else 0.0, atol=1e-5)
 
 
+def test_a_fall_is_worth_what_it_is_said_to_be():
+    """A fall at the last of three steps, rewards of one, discount 1/2, lambda 1, no critic."""
+    zero, fell = np.zeros((3, 1), np.float32), np.array([[False], [False], [True]])
+    next_value = np.array([[0.0], [0.0], [7.0]], np.float32)  # the critic's of a fallen state is not asked for
+    returns = generalized_advantage(zero + 1.0, zero, next_value, fell, zero > 0, 0.5, 1.0, fall_value=-8.0)
+    # Backward: 1 - 8 / 2 = -3; 1 - 3 / 2 = -0.5; 1 - 0.5 / 2 = 0.75.
+    np.testing.assert_allclose(returns[:, 0], [0.75, -0.5, -3.0], atol=1e-6)
+
+
 # --- probe environments ----------------------------------------------------------------------------------------------
 
 
