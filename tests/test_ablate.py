@@ -88,7 +88,7 @@ def test_errors_exit_with_code_two(tmp_path, capsys):
     with pytest.raises(SystemExit) as exit_info:
         ablate.cli(["--out", str(tmp_path), "--methods", "gail"])
     assert exit_info.value.code == 2
-    assert capsys.readouterr().err == f"ablate: unknown method 'gail': expected one of {', '.join(priors.METHODS)}\n"
+    assert capsys.readouterr().err == f"fmpjax: unknown method 'gail': expected one of {', '.join(priors.METHODS)}\n"
     with pytest.raises(UserError, match="--workers is 0: expected at least 1"):
         cells.run(cells.plan(cells.Specification(preset="smoke", methods=("fmp",))), tmp_path, workers=0)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from test_train import TINY, settings, tiny
 
-from fmpjax import cli, motion, priors, sharding
+from fmpjax import cli, motion, priors, runs, sharding
 from fmpjax.errors import UserError
 from fmpjax.train import Trainer, stack, unstack
 
@@ -110,21 +110,20 @@ def test_two_processes_are_one(tmp_path):
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
-    common = ["train", "--preset", "smoke", *settings(TINY | {"transitions": 8 * 8 * 4, "evaluations": (1.0,)})]
+    short = {"transitions": 8 * 8 * 4, "evaluations": (1.0,)}
+    planned, common = tiny(**short), ["train", "--preset", "smoke", *settings(TINY | short)]
     joined = ["--run", tmp_path / "two", "--distributed", "--coordinator", address, "--processes", 2]
-    flags = "import os; os.environ['XLA_FLAGS'] += ' --xla_force_host_platform_device_count={}'; "
+    flags = "import os; os.environ['XLA_FLAGS'] += ' --xla_force_host_platform_device_count=2'; "
     main = "import sys; from fmpjax.cli import main; main(sys.argv[1:])"
 
-    def start(devices, *arguments):
-        command = [sys.executable, "-c", flags.format(devices) + main, *map(str, [*common, *arguments])]
+    def start(*arguments):
+        command = [sys.executable, "-c", flags + main, *map(str, [*common, *arguments])]
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
-    runs = [start(2, *joined, "--process", i) for i in range(2)]
-    said = [run.communicate(timeout=300)[0] for run in runs]
-    assert [run.returncode for run in runs] == [0, 0], said
-    single = start(1, "--run", tmp_path / "one")
-    alone = single.communicate(timeout=300)[0]
-    assert single.returncode == 0, alone
+    pair = [start(*joined, "--process", i) for i in range(2)]
+    said = [process.communicate(timeout=300)[0] for process in pair]
+    assert [process.returncode for process in pair] == [0, 0], said
+    assert runs.train(runs.Run.create(tmp_path / "one", planned)) is runs.End.BUDGET
     assert "best policy" in said[0]
     assert "best policy" not in said[1]
 

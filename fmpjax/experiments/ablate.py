@@ -9,10 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import tyro
-
-from fmpjax.errors import UserError
-from fmpjax.experiments import cells, table
+from fmpjax.experiments import cells, results, table
 from fmpjax.experiments.cells import Cell, Specification
 
 
@@ -87,17 +84,11 @@ def films(planned: Sequence[Cell], folder: Path, seconds: float = 10.0) -> list[
     return paths
 
 
-def cli(arguments: list[str] | None = None) -> None:
-    """Entry point: bad input is one sentence and exit code 2."""
+def cli(arguments: Sequence[str] | None = None) -> None:
+    """Entry point."""
     # An exception, so that who ends the comparison ends its cells, which save.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    try:
-        tyro.cli(main, args=arguments)
-    except UserError as error:
-        print(f"ablate: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
+    results.entry(main, arguments)
 
 
 if __name__ == "__main__":

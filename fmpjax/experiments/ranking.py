@@ -7,17 +7,14 @@ as ``python -m fmpjax.experiments.ranking --run RUN`` or, for the start of train
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 from fmpjax import features, priors
-from fmpjax.errors import UserError
-from fmpjax.experiments import histories
+from fmpjax.experiments import histories, results
 from fmpjax.motion import MotionClip, resample
 from fmpjax.train import Trainer
 
@@ -130,8 +127,4 @@ def main(run: Path, start: bool = False, last: bool = False, updates: int = 512,
 
 
 if __name__ == "__main__":
-    try:
-        tyro.cli(main)
-    except UserError as error:
-        print(f"fmpjax: {error}", file=sys.stderr)
-        sys.exit(2)
+    results.entry(main)

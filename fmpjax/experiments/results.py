@@ -105,10 +105,11 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def entry(main: Callable[..., None], arguments: Sequence[str] | None = None) -> None:
-    """An experiment's command line: bad input is one sentence and exit code 2."""
+def entry(main: Callable[..., Any] | Mapping[str, Callable[..., Any]], arguments: Sequence[str] | None = None) -> None:
+    """An experiment's command line, or that of several by name: bad input is one sentence and exit code 2."""
+    parse = tyro.cli if callable(main) else tyro.extras.subcommand_cli_from_dict
     try:
-        tyro.cli(main, args=arguments)
+        parse(main, args=arguments)
     except UserError as error:
         print(f"fmpjax: {error}", file=sys.stderr)
         sys.exit(2)

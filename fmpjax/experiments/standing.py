@@ -9,7 +9,6 @@ the few updates of a rollout follow the transport they are fitted to, and which 
 import csv
 import dataclasses
 import json
-import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -24,7 +23,7 @@ from fmpjax import features, physics, potential, ppo, priors, runs
 from fmpjax.config import Config, preset
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Evaluator
-from fmpjax.experiments import reference
+from fmpjax.experiments import reference, results
 from fmpjax.priors import flow
 from fmpjax.priors.base import couple, median_reward
 from fmpjax.robots import Robot
@@ -391,8 +390,4 @@ def figure(out: Path, runs: tuple[Path, ...]) -> Path:
 
 
 if __name__ == "__main__":
-    try:
-        tyro.extras.subcommand_cli_from_dict({"measure": measure, "look": look, "figure": figure})
-    except UserError as error:
-        print(f"fmpjax: {error}", file=sys.stderr)
-        sys.exit(2)
+    results.entry({"measure": measure, "look": look, "figure": figure})
