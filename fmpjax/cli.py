@@ -1,6 +1,7 @@
 """The command line: ``fmpjax train``, ``evaluate``, ``render``, ``export``, ``report``, ``motion``, ``config``."""
 
 import dataclasses
+import math
 import os
 import sys
 import warnings
@@ -100,12 +101,13 @@ class Train:
         if self.run is None:
             raise UserError("--resume needs the run's folder: name it with --run")
         changes = self._changes()
-        folders = sorted(self.run.glob("seed*"), key=lambda path: (len(path.name), path.name))
+        folders = [path for path in self.run.glob("seed*") if path.is_dir()]
+        folders.sort(key=lambda path: (len(path.name), path.name))
         if (self.run / "config.json").exists() or not folders:
             folders = [self.run]
         elif "seed" in changes:
             # Some of the seeds: as many as --seeds says, one by default, from --seed on.
-            first = int(changes["seed"])
+            first = configuration.with_changes(configuration.Config(), {"seed": changes["seed"]}).seed
             folders = [self.run / f"seed{first + i}" for i in range(self.seeds or 1)]
         if self.seeds is not None and self.seeds != len(folders):
             raise UserError(f"run {self.run} has {len(folders)} seeds: it cannot go on with {self.seeds}")
@@ -142,7 +144,8 @@ class Train:
         if self.seeds is None:
             return [runs.Run.create(folder, config)]
         seeds = range(config.seed, config.seed + self.seeds)
-        return [runs.Run.create(folder / f"seed{s}", dataclasses.replace(config, seed=s)) for s in seeds]
+        configs = [configuration.validate(dataclasses.replace(config, seed=seed)) for seed in seeds]
+        return [runs.Run.create(folder / f"seed{each.seed}", each) for each in configs]
 
     def _changes(self) -> dict[str, object]:
         named = {
@@ -207,6 +210,8 @@ class Render:
         runs = _runs()
         from fmpjax.evaluate import Evaluator
 
+        if not 0 < self.seconds < math.inf:
+            raise UserError(f"--seconds is {self.seconds:g}: expected a number above 0")
         run = runs.Run.open(self.run)
         trainer, state = run.policy()
         print("rolling out and rendering ...", flush=True)

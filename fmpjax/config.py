@@ -305,7 +305,7 @@ def _convert(key: str, value: Any, like: Any) -> Any:
         if kind is int and (isinstance(value, bool) or value != int(value)):
             raise ValueError
         return kind(value)
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, OverflowError):
         raise UserError(f"setting {key} is {value!r}: expected {kind.__name__} such as {like!r}") from None
 
 

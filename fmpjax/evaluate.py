@@ -40,7 +40,7 @@ class Share(NamedTuple):
     motion: str
     episodes: int
     falls: int
-    late_speed: float  # m/s
+    late_speed: float  # m/s, along the own heading where the demonstration turns
     demonstration_speed: float  # m/s
 
 
@@ -64,7 +64,8 @@ class Evaluation:
     imbalance: float
     displacement: float  # m
     demonstration_speed: float  # m/s
-    demonstration_turn: float  # rad/s
+    demonstration_turn: float  # rad/s, to the left
+    demonstration_turning: float  # rad/s, either way
     joint_ranges: tuple[float, ...]  # degrees, six sagittal joints
     expert_ranges: tuple[float, ...]  # degrees
     motions: tuple[Share, ...] = ()  # where there are several
@@ -75,7 +76,7 @@ class Evaluation:
 
         Too fast is no better than too slow. Where the demonstration turns, speeds are along the own heading.
         """
-        late = self.path_speed if abs(self.demonstration_turn) > TURNS else self.late_speed
+        late = self.path_speed if self.demonstration_turning > TURNS else self.late_speed
         error = 1.0 if np.isnan(late) else abs(late - self.demonstration_speed) / max(self.demonstration_speed, 0.1)
         return (1.0 - self.falls / self.episodes) * max(0.0, 1.0 - error)
 
@@ -165,6 +166,7 @@ class Evaluator:
         feet, contact = self._feet(jnp.asarray(played.qpos[:, detail]))
         late = metrics.summarise(speed)
         own_speed = [planar_speed(clip) for clip in library.clips]
+        own_turn = np.array([turning(clip) for clip in library.clips])
         return Evaluation(
             episodes=self.count,
             falls=int(played.fell.sum()),
@@ -182,10 +184,11 @@ class Evaluator:
             imbalance=metrics.summarise(metrics.left_right_imbalance(ranges)).mean,
             displacement=metrics.summarise(displacement).mean,
             demonstration_speed=float(library.mean(own_speed)),
-            demonstration_turn=float(library.mean([turning(clip) for clip in library.clips])),
+            demonstration_turn=float(library.mean(own_turn)),
+            demonstration_turning=float(library.mean(abs(own_turn))),
             joint_ranges=tuple(np.degrees(_finite_mean(ranges)).round(2).tolist()),
             expert_ranges=tuple(np.degrees(expert).round(2).tolist()),
-            motions=self._shares(played, speed, own_speed),
+            motions=self._shares(played, np.where(abs(own_turn[played.clip]) > TURNS, path_speed, speed), own_speed),
         )
 
     def _shares(self, played: Episodes, speed: np.ndarray, own_speed: list[float]) -> tuple[Share, ...]:

@@ -34,7 +34,9 @@ class MetricsLog:
             writer.writeheader()
             writer.writerows(self.rows)
         os.replace(partial, self._path)
-        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=iteration or None)
+        # TensorBoard drops what it holds from this step on; steps are transitions there.
+        seen = int(self.rows[-1]["transitions"]) + 1 if self.rows else None
+        self._board = SummaryWriter(str(run / "tensorboard"), purge_step=seen)
 
     @property
     def seconds(self) -> float:
@@ -65,7 +67,7 @@ class MetricsLog:
         if not path.exists():
             return []
         with path.open(newline="") as file:
-            return [row for row in csv.DictReader(file) if None not in row.values()]
+            return [row for row in csv.DictReader(file) if None not in row.values() and set(_FIRST) <= set(row)]
 
 
 class Progress:

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import enum
+import fcntl
 import importlib.metadata
 import json
 import os
@@ -13,9 +14,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -106,10 +108,25 @@ class Run:
 
     def resumed(self) -> None:
         """Say in the provenance that this process goes on with the run."""
-        path, here = self.folder / "provenance.json", provenance()
-        made = json.loads(path.read_text())
+        made, here = self.provenance(), provenance()
         again = {key: here[key] for key in ("command", "date", "commit", "uncommitted_changes", "device")}
-        write(path, json.dumps(made | {"resumed": [*made.get("resumed", []), again]}, indent=1))
+        made |= {"resumed": [*made.get("resumed", []), again]}
+        write(self.folder / "provenance.json", json.dumps(made, indent=1))
+
+    def provenance(self) -> dict[str, Any]:
+        """What ``provenance.json`` says.
+
+        Raises:
+          UserError: it is missing or broken.
+        """
+        path = self.folder / "provenance.json"
+        try:
+            made = json.loads(path.read_text())
+        except (OSError, ValueError):
+            made = None
+        if not isinstance(made, dict):
+            raise UserError(f"{path} cannot be read: expected the JSON object that the run's start wrote")
+        return made
 
     def trainer(self) -> Trainer:
         """The run's parts."""
@@ -123,13 +140,21 @@ class Run:
 
     def _demonstration(self, config: Config) -> motion.MotionLibrary:
         """The clips as the folder holds them, whoever asks: the first process and a resumed one see the same bits."""
-        names = [Path(name).stem for name, _ in motion.library.parse(config.motion)]
+        motions = self.motions(config)
         clips = [
-            motion.load(path, rate=round(config.control_rate, 6), robot=config.robot)
-            for path in self._demonstration_files(len(names))
+            dataclasses.replace(
+                motion.load(path, rate=round(config.control_rate, 6), robot=config.robot), name=Path(name).stem
+            )
+            for path, (name, _) in zip(self._demonstration_files(len(motions)), motions, strict=True)
         ]
-        named = (dataclasses.replace(clip, name=name) for clip, name in zip(clips, names, strict=True))
-        return motion.MotionLibrary(tuple(named), motion.library.shares(config.motion))
+        total = sum(weight for _, weight in motions)
+        return motion.MotionLibrary(tuple(clips), tuple(weight / total for _, weight in motions))
+
+    def motions(self, config: Config) -> list[tuple[str, float]]:
+        """Names and weights of the demonstrations; a file's name may hold commas and colons, and the file be gone."""
+        if not self._demonstration_files(2)[1].exists():
+            return [(config.motion, 1.0)]
+        return motion.library.parse(config.motion)
 
     def policy(self, *, best: bool = True) -> tuple[Trainer, TrainState]:
         """The run's parts and its best state, or its newest where no evaluation chose a best one."""
@@ -158,7 +183,7 @@ def train(*group: Run, resume: bool = False, minutes: float | None = None, devic
     Raises:
       UserError: the runs do not belong together, too much was not finite, or memory ran out; what was saved stays good.
     """
-    with _enough_memory(group):
+    with _enough_memory(group), _held(group):
         return _train(*group, resume=resume, minutes=minutes, devices=devices)
 
 
@@ -218,7 +243,8 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
             out_of_time = sharding.agree(minutes is not None and time.monotonic() - began + 1.5 * took > minutes * 60)
             asked = sharding.agree(stop.requested)
             at_milestone = any(done >= m > evaluated for m in milestones)
-            evaluating = (at_milestone or out_of_time) and not asked
+            # A run that is asked to stop saves and no more, but its last iteration comes only once.
+            evaluating = (at_milestone or out_of_time) and (not asked or done >= config.iterations)
             saving = sharding.agree(evaluating or time.monotonic() - saved > _SAVE_INTERVAL)
             # Before the evaluation, after which processes are no longer in step.
             whole = [sharding.on_host(each) for each in states] if saving else []
@@ -251,6 +277,21 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
     end = End.SIGNAL if asked else End.TIME
     progress.note(f"{end.value} at {transitions:,} transitions; saved. Go on with --resume.")
     return end
+
+
+@contextlib.contextmanager
+def _held(group: Sequence[Run]) -> Iterator[None]:
+    """Keep other processes from training in the run folders; a process that ends, however, lets go of them."""
+    with contextlib.ExitStack() as held:
+        for run in group if sharding.primary() else ():
+            try:
+                lock = held.enter_context((run.folder / ".lock").open("w"))
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UserError(f"run {run.folder} is being trained by another process: wait for its end") from None
+            except OSError:  # a file system that has no locks or cannot be written, which saving will say
+                pass
+        yield
 
 
 @contextlib.contextmanager
@@ -297,12 +338,28 @@ def _shared_trainer(group: Sequence[Run]) -> Trainer:
 
 
 def _start(trainer: Trainer, group: Sequence[Run], resume: bool) -> list[TrainState]:
-    """States to begin with: those of the newest checkpoint that all runs have, or those of their seeds."""
+    """States to begin with: those of the newest checkpoint that all runs have, or those of their seeds.
+
+    Raises:
+      UserError: there are checkpoints, and none that all runs have.
+    """
     states = [trainer.init(run.config.seed) for run in group]
-    common = set.intersection(*(run.checkpoints.iterations() for run in group)) if resume else set()
-    if not common:
+    if not resume:
         return states
-    return [run.checkpoints.restore(like, max(common)) for run, like in zip(group, states, strict=True)]
+    newest = [run.checkpoints.iterations() for run in group]
+    # Where the newest are gone the best one is a whole state, too.
+    saved = [found | run.checkpoints.iterations(best=True) for found, run in zip(newest, group, strict=True)]
+    common = set.intersection(*newest) or set.intersection(*saved)
+    if not common:
+        if any(saved):  # never begin anew over what is there
+            has = ", ".join(f"{r.folder} has {sorted(found) or 'none'}" for r, found in zip(group, saved, strict=True))
+            raise UserError(f"{has}: expected a checkpoint of one iteration in all runs; resume each alone with --seed")
+        return states
+    start = max(common)
+    return [
+        run.checkpoints.restore(like, start, best=start not in found)
+        for run, like, found in zip(group, states, newest, strict=True)
+    ]
 
 
 def finish(run: Run) -> list[Path]:
@@ -335,16 +392,18 @@ def export(run: Run, out: Path) -> list[Path]:
       UserError: ``out`` holds another run's results, or cannot be written.
     """
     # Where the demonstration and the run lay is this machine's affair; their names are everybody's.
-    texts = {n: (run.folder / n).read_text() for n in ("config.json", "provenance.json")}
-    folders = str(run.folder.resolve()), str(run.folder)
-    for path in (*(name for name, _ in motion.library.parse(run.config.motion)), *folders):
-        texts = {n: text.replace(path, Path(path).name) for n, text in texts.items()}
-    if (out / "config.json").exists() and (out / "config.json").read_text() != texts["config.json"]:
+    if out.resolve() == run.folder.resolve():
+        raise UserError(f"{out} is the run itself: expected another folder")
+    places = [*(name for name, _ in run.motions(run.config)), run.folder.resolve(), run.folder]
+    texts = {"config.json": (run.folder / "config.json").read_text().rstrip("\n")}
+    texts["provenance.json"] = json.dumps(run.provenance(), indent=1)
+    texts = {n: without_places(text, places) for n, text in texts.items()}
+    if (out / "config.json").exists() and (out / "config.json").read_text().rstrip("\n") != texts["config.json"]:
         raise UserError(f"{out} holds results of another configuration: expected a new folder or this run's own")
     try:
         out.mkdir(parents=True, exist_ok=True)
         for n, text in texts.items():
-            write(out / n, text.rstrip("\n"))
+            write(out / n, text)
         copied = [Path(shutil.copy2(run.folder / n, out / n)) for n in _EXPORTED if (run.folder / n).exists()]
         return [*(out / n for n in texts), *copied]
     except OSError as error:
@@ -358,10 +417,10 @@ def video(
     rate = trainer.config.control_rate
     stride = 2  # 25 pictures a second
     episode = _longest(played)
-    steps = slice(0, min(int(seconds * rate), int(played.length[episode])), stride)
-    shown = {"policy": played.qpos[steps, episode]}
+    last = int(seconds * rate)
+    shown = {"policy": played.qpos[: min(last, int(played.length[episode])) : stride, episode]}
     if not alone:
-        shown["demonstration"] = trainer.library.clips[played.clip[episode]].qpos[::stride]
+        shown["demonstration"] = trainer.library.clips[played.clip[episode]].qpos[:last:stride]
     panes = len(shown)
     frames = render.grid(trainer.robot, list(shown.values()), list(shown), columns=panes, width=360 * panes, height=360)
     return render.write_video(path or run.folder / "policy.mp4", frames, fps=rate / stride)
@@ -485,6 +544,14 @@ class _StopSignals:
     def __exit__(self, *exception):
         for number, handler in self._before.items():
             signal.signal(number, handler)
+
+
+def without_places(text: str, places: Iterable[Path | str]) -> str:
+    """JSON ``text`` with the files and folders of this machine cut to their names."""
+    for place in sorted(map(str, places), key=len, reverse=True):
+        name = Path(place).name or place  # "." has none
+        text = text.replace(json.dumps(place)[1:-1], json.dumps(name)[1:-1])
+    return text
 
 
 def write(path: Path, text: str) -> None:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from fmpjax import features, physics, priors, robots, sharding
+from fmpjax import features, metrics, physics, priors, robots, sharding
 from fmpjax.config import Config
 from fmpjax.env import PER_ENVIRONMENT, Env, EnvState, Steps
 from fmpjax.errors import UserError
@@ -153,6 +153,11 @@ def _check(clip: MotionClip, config: Config) -> None:
         )
     if clip.robot != config.robot:
         raise UserError(f"motion {clip.name} is of robot {clip.robot!r}: expected {config.robot!r}")
+    if clip.duration < metrics.WINDOW:
+        raise UserError(
+            f"motion {clip.name} lasts {clip.duration:.2f} s: expected at least {metrics.WINDOW:g} s, the window in "
+            "which ranges of its joints are taken"
+        )
     if len(clip) <= config.features.history:
         raise UserError(
             f"setting features.history is {config.features.history}: expected fewer than the {len(clip)} samples "

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -82,6 +83,10 @@ def test_missing_specification_and_unknown_names(tmp_path):
         cells.plan(cells.Specification(resets=("random",)))
     with pytest.raises(UserError, match=r"unknown setting 'ppo.gamma'"):
         cells.plan(cells.Specification(settings={"ppo.gamma": 0.9}))
+    with pytest.raises(UserError, match="the plan names fmp-dataset/seed0 2 times"):
+        cells.plan(cells.Specification(methods=("fmp",), seeds=(0, 0)))
+    with pytest.raises(UserError, match="the plan has no cells"):
+        cells.plan(cells.Specification(methods=()))
 
 
 def test_errors_exit_with_code_two(tmp_path, capsys):
@@ -89,6 +94,14 @@ def test_errors_exit_with_code_two(tmp_path, capsys):
         ablate.cli(["--out", str(tmp_path), "--methods", "gail"])
     assert exit_info.value.code == 2
     assert capsys.readouterr().err == f"fmpjax: unknown method 'gail': expected one of {', '.join(priors.METHODS)}\n"
+    file, folder = tmp_path / "file", tmp_path / "out"
+    file.write_text("")
+    (folder / "fmp-dataset" / "seed0").mkdir(parents=True)
+    (folder / "fmp-dataset" / "seed0" / "config.json").write_text('{"seed": ')
+    for where, message in ((file, "cannot be written: expected a folder"), (folder, "is not valid JSON")):
+        with pytest.raises(SystemExit):
+            ablate.cli(["--out", str(where), "--preset", "smoke"])
+        assert message in capsys.readouterr().err
     with pytest.raises(UserError, match="--workers is 0: expected at least 1"):
         cells.run(cells.plan(cells.Specification(preset="smoke", methods=("fmp",))), tmp_path, workers=0)
 
@@ -151,13 +164,23 @@ def test_finished_cells_are_left_alone_and_unfinished_ones_go_on(ablated, capsys
     """A cell cut back to half its course, as a kill would leave it, is finished; the other is not touched."""
     folder, planned = ablated
     out = folder / "out"
+    cell = out / "fmp-fixed/seed0"
+    before = table.evaluations(planned[0], out)
+    assert {p.name for p in (cell / "checkpoints").iterdir() if p.name.isdigit()} == {"2", "4"}
+    shutil.rmtree(cell / "checkpoints" / "4")
+    shutil.rmtree(cell / "best" / "4", ignore_errors=True)
     stamp = (out / "barycentric-fixed/seed0" / "metrics.csv").stat().st_mtime_ns
-    (out / "fmp-fixed/seed0" / "evaluation.json").unlink()
+    (cell / "evaluation.json").unlink()
     assert not cells.finished(planned[0], out)
     cells.run(planned, out)
     assert cells.finished(planned[0], out)
     assert (out / "barycentric-fixed/seed0" / "metrics.csv").stat().st_mtime_ns == stamp
     assert "2 cells, 1 of them finished before" in capsys.readouterr().out
+    after = table.evaluations(planned[0], out)
+    assert after[0] == before[0]  # its first half was not trained again, training time included
+    assert [row.transitions for row in after] == [128, 256] and after[1].figures == before[1].figures
+    (again,) = json.loads((cell / "provenance.json").read_text())["resumed"]
+    assert again["command"].startswith("fmpjax train --preset smoke --set=")
 
 
 @pytest.mark.slow
@@ -205,6 +228,9 @@ def test_table_has_the_paper_beside_ours():
     assert lines[2].startswith("| dataset | FMP | 2 | 490.0 ± 0.0 | 5.0 ± 0.0 | 0.650 ± 0.635 |")
     assert lines[3].startswith("| dataset | FMP, the paper's | 1 | 500.0 | 0.0 | 0.727 | 1.119 | 9.95 | 0.159 |")
     assert lines[4].startswith("| dataset | AMP | 1 | 490.0 | 5.0 | – |")
+    # Of whom a figure is the mean, where not of all.
+    lines = table.markdown([row("fmp", i, v) for i, v in enumerate((0.88, math.nan, 0.9))]).splitlines()
+    assert "| 0.890 ± 0.127 (2 of 3) |" in lines[2]
     assert len({line.count("|") for line in lines}) == 1
     latex = table.latex([row("fmp", 0, 0.6)])
     assert latex.count(r"\\") == 3

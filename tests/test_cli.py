@@ -76,6 +76,7 @@ def made(tmp_path):
         (["--transitions", "0"], ["transitions is 0"]),
         (["--seed", "-1"], ["seed is -1"]),
         (["--seed", str(2**40)], [f"seed is {2**40}"]),
+        (["--seed", str(2**32 - 1), "--seeds", "2"], [f"seed is {2**32}"]),
         (["--minutes", "-3"], ["--minutes is -3"]),
         (["--minutes", "0"], ["--minutes is 0"]),
         (["--minutes", "nan"], ["--minutes is nan"]),
@@ -197,6 +198,40 @@ def test_resume_with_another_option(refused, made, arguments, expected):
 def test_configuration_that_is_not_json(refused, made):
     (made.folder / "config.json").write_text('{"seed": ')
     assert "config.json is not valid JSON" in refused("evaluate", made.folder)
+    (made.folder / "config.json").write_text('{"env.count": Infinity}')
+    assert "setting env.count is inf: expected int" in refused("evaluate", made.folder)
+
+
+def test_provenance_that_is_not_json(refused, made):
+    for text in ('{"command": ', "[]"):
+        (made.folder / "provenance.json").write_text(text)
+        assert "provenance.json cannot be read: expected" in refused("export", made.folder, "out")
+
+
+def test_a_run_is_not_exported_into_itself(refused, made):
+    assert "is the run itself: expected another folder" in refused("export", made.folder, made.folder)
+
+
+@pytest.mark.parametrize("seconds", ["0", "nan", "inf"])
+def test_length_of_a_video(refused, made, seconds):
+    assert f"--seconds is {seconds}: expected a number above 0" in refused("render", made.folder, "--seconds", seconds)
+
+
+def test_seeds_of_a_group(refused, tmp_path):
+    runs.Run.create(tmp_path / "group" / "seed0", preset("smoke"))
+    (tmp_path / "group" / "seed0.log").write_text("of another program")
+    resume = ("train", "--resume", "--run", "group")
+    assert "setting seed is 'abc': expected int" in refused(*resume, "--set", "seed=abc")
+    assert "has 1 seeds: it cannot go on with 2" in refused(*resume, "--seeds", "2")
+
+
+def test_a_clip_may_have_any_name_and_go(tmp_path, rows, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a,b.csv", "take:2.csv"):
+        path = write_csv(tmp_path / name, np.repeat(rows, 2, axis=0))
+        run = runs.Run.create(tmp_path / f"run of {name}", preset("smoke", motion=name))
+        path.unlink()
+        assert runs.Run.open(run.folder).trainer().clip.name == path.stem
 
 
 # --- the real thing --------------------------------------------------------------------------------------------------

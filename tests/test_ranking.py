@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from fmpjax import config as configuration
-from fmpjax import features, motion
+from fmpjax import features, motion, priors
+from fmpjax.errors import UserError
 from fmpjax.experiments import ranking
 from fmpjax.train import Trainer
 
@@ -53,3 +54,8 @@ def test_demonstration_beats_frozen_and_slowed_copies_when_the_pool_stands(train
         assert result[name]["beaten"] > 0.75, name
     # The pool itself is the worst place to be: its median is the zero of the margin.
     assert good["margin"] > 1.0
+
+
+def test_only_a_potential_is_ranked():
+    with pytest.raises(UserError, match="method is 'amp': expected one that fits a potential, fmp, endpoint, value"):
+        priors.check_potential("amp")

@@ -341,7 +341,9 @@ def test_report_is_one_page_that_needs_nothing_else(tmp_path):
     page = (tmp_path / "report.html").read_text()
     assert set(re.findall(r'(?:src|href)="(.*?)[;"]', page)) == {"data:image/png", "data:video/mp4"}
     assert "http" not in page and "<script" not in page
-    assert page.count("Not measured here") == 4 and "commit 0123456789ab" in page
+    assert page.count("Not measured here") == 4
+    assert "generalization --run STANDING_RUN --walking WALKING_RUN --out FOLDER" in page
+    assert "commit 0123456789ab" in page
     assert page.count('<span class="yes">') == 6 and '<span class="no">' not in page
     # The paper's figures stand beside ours.
     assert "0.284" in page and "0.300" in page and "a ratio of 1.33 (the paper&#x27;s 1.41)" in page
@@ -366,6 +368,11 @@ def test_report_without_results(tmp_path, capsys):
     (tmp_path / "curvature.json").write_text("{}")
     with pytest.raises(UserError, match="curvature.json is no result of this version"):
         report.write(tmp_path, tmp_path / "report.html")
+    (tmp_path / "curvature.json").unlink()
+    for broken in ({"provenance": {}}, {"provenance": None}):
+        (tmp_path / "static_teacher.json").write_text(json.dumps(static_record() | broken))
+        with pytest.raises(UserError, match="static_teacher.json is no result of this version"):
+            report.write(tmp_path, tmp_path / "report.html")
     assert not list(tmp_path.glob("report*"))
 
 

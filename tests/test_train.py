@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import fcntl
 import json
 import logging
 import os
@@ -16,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tensorboardX.proto.event_pb2 import Event
 
 import fmpjax
 from fmpjax import cli, config, runs
@@ -23,6 +25,7 @@ from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import preset
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Episodes, Evaluation, Evaluator
+from fmpjax.logs import MetricsLog
 from fmpjax.priors import Expert
 from fmpjax.train import Trainer
 
@@ -214,9 +217,14 @@ def test_a_resume_in_a_new_process_is_exact(trained, stopped):
 
 
 @pytest.mark.slow
-def test_a_larger_budget_goes_on_as_if_it_had_been_the_first(trained, tmp_path):
+def test_a_larger_budget_goes_on_as_if_it_had_been_the_first(trained, tmp_path, monkeypatch):
+    """A signal in its last iterations costs the first budget nothing, not even the evaluation at its end."""
     run = runs.Run.create(tmp_path / "run", tiny(transitions=TINY["transitions"] // 5))
-    assert runs.train(run) is runs.End.BUDGET
+    with monkeypatch.context() as patch:
+        patch.setattr(runs._StopSignals, "__enter__", lambda self: setattr(self, "requested", True) or self)
+        patch.setattr(runs._StopSignals, "__exit__", lambda *_: None)
+        assert runs.train(run) is runs.End.BUDGET
+    assert rows(run.folder)[-1]["eval/quality"] and Checkpoints(run.folder).latest(best=True) == 2
     run.extend(TINY["transitions"])
     assert run.config == tiny()
     assert runs.train(run, resume=True) is runs.End.BUDGET
@@ -275,6 +283,49 @@ def test_rows_beyond_the_checkpoint_are_written_again(trained, tmp_path, monkeyp
     again = leaves(folder)
     for name, leaf in leaves(trained).items():
         np.testing.assert_array_equal(leaf, again[name], err_msg=name)
+
+
+@pytest.mark.slow
+def test_a_resume_never_begins_anew_over_what_is_there(trained, trainer, tmp_path):
+    """The best state where the newest are gone; a refusal where runs have no iteration in common."""
+    one, other = tmp_path / "one", tmp_path / "other"
+    shutil.copytree(trained, one)
+    shutil.rmtree(one / "checkpoints")
+    best = Checkpoints(trained).latest(best=True)
+    (state,) = runs._start(trainer, [runs.Run.open(one)], True)
+    assert int(state.iteration) == best
+    shutil.copytree(one, other)
+    (other / "best" / str(best)).rename(other / "best" / "99")
+    with pytest.raises(UserError, match=rf"one has \[{best}\], .*other has \[99\]: expected a checkpoint of one iter"):
+        runs._start(trainer, [runs.Run.open(one), runs.Run.open(other)], True)
+    shutil.rmtree(one / "best")
+    assert int(runs._start(trainer, [runs.Run.open(one)], True)[0].iteration) == 0
+
+
+@pytest.mark.slow
+def test_two_processes_never_train_in_one_folder(trained):
+    with (trained / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(UserError, match="is being trained by another process: wait for its end"):
+            runs.train(runs.Run.open(trained), resume=True)
+    assert runs.train(runs.Run.open(trained), resume=True) is runs.End.BUDGET
+
+
+def test_tensorboard_keeps_the_course_before_a_resume(tmp_path):
+    """Its steps are transitions, and what a resume computes again is purged from there on, not from the iteration."""
+    log = MetricsLog(tmp_path, ["x"])
+    for iteration in (2, 4, 6):
+        log.write(iteration, 64 * iteration, 1.0, {"x": 0.5})
+    log.close()
+    shutil.rmtree(tmp_path / "tensorboard")
+    MetricsLog(tmp_path, ["x"], 4).close()
+    (path,) = (tmp_path / "tensorboard").iterdir()
+    data, events = path.read_bytes(), []
+    while data:  # a record: its length (8 bytes), a checksum (4), the event, a checksum (4)
+        size = int.from_bytes(data[:8], "little")
+        events.append(Event.FromString(data[12 : 12 + size]))
+        data = data[16 + size :]
+    assert [event.step for event in events if event.HasField("session_log")] == [257]
 
 
 # --- bad checkpoints -------------------------------------------------------------------------------------------------
@@ -336,9 +387,15 @@ def test_a_clip_of_another_rate_or_robot_is_refused(walk):
 
 
 def test_a_clip_shorter_than_a_window_is_refused(walk):
-    short = dataclasses.replace(walk, qpos=walk.qpos[:20], qvel=walk.qvel[:20])
-    with pytest.raises(UserError, match="features.history is 20: expected fewer than the 20 samples"):
-        Trainer(tiny(**{"features.history": 20}), short)
+    short = dataclasses.replace(walk, qpos=walk.qpos[:60], qvel=walk.qvel[:60])
+    with pytest.raises(UserError, match="features.history is 60: expected fewer than the 60 samples"):
+        Trainer(tiny(**{"features.history": 60}), short)
+
+
+def test_a_clip_too_short_to_evaluate_is_refused(walk):
+    short = dataclasses.replace(walk, qpos=walk.qpos[:45], qvel=walk.qvel[:45])
+    with pytest.raises(UserError, match=r"lasts 0.\d+ s: expected at least 1 s"):
+        Trainer(tiny(), short)
 
 
 def test_a_configuration_survives_its_file():
@@ -493,3 +550,21 @@ def test_quality(falls, speed, demonstration, expected):
     nothing = dict.fromkeys(names, 0.0)
     known = {"episodes": 10, "falls": falls, "late_speed": speed, "demonstration_speed": demonstration}
     assert Evaluation(**nothing | known).quality == pytest.approx(expected)
+    # Turns to the left and to the right, whose mean is none: the speed along the own heading counts.
+    turning = known | {"late_speed": 0.1, "path_speed": speed, "demonstration_turning": 0.4}
+    assert Evaluation(**nothing | turning).quality == pytest.approx(expected)
+
+
+@pytest.mark.slow
+def test_a_video_is_as_long_as_it_is_asked_to_be(trainer, fallen, tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(runs.render, "grid", lambda robot, motions, labels, **_: shown.extend(map(len, motions)))
+    monkeypatch.setattr(runs.render, "write_video", lambda path, frames, fps: path)
+    runs.video(runs.Run(tmp_path), trainer, fallen._replace(length=np.full(6, 60)), seconds=0.4)
+    assert shown == [10, 10]  # 20 steps of 0.02 s, every second one
+
+
+def test_places_of_this_machine_are_cut_to_their_names():
+    text = json.dumps({"a": 0.975, "run": "/home/ada/läufe/mine", "of": "/home/ada/läufe/mine/best", "here": "./x"})
+    cut = json.loads(runs.without_places(text, [".", Path("/home/ada/läufe/mine")]))
+    assert cut == {"a": 0.975, "run": "mine", "of": "mine/best", "here": "./x"}

@@ -50,6 +50,7 @@ def main(
     }  # fmt: skip
     specification = dataclasses.replace(specification, **{k: v for k, v in named.items() if v is not None})
     planned = cells.plan(specification)
+    results.check_folder(out)
     cells.run(planned, out, workers, together=together)
     paths = table.write(planned, out, [spec] if spec else [])
     print((out / "table.md").read_text())

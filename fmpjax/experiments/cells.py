@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 import tomllib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -110,7 +111,7 @@ def plan(specification: Specification) -> list[Cell]:
     """The cells of a specification, seeds innermost.
 
     Raises:
-      UserError: a name, setting or value that no configuration can have.
+      UserError: a name, setting or value that no configuration can have, or a cell twice, or none at all.
     """
     s = specification
     for method in s.methods:
@@ -124,6 +125,11 @@ def plan(specification: Specification) -> list[Cell]:
         changes |= {**s.settings, **variants[variant]}
         group = "-".join(part for part in (method, reset, variant) if part)
         cells.append(Cell(f"{group}/seed{seed}", variant, configuration.preset(s.preset, **changes), changes))
+    if not cells:
+        raise UserError("the plan has no cells: expected a method, a reset and a seed at least")
+    for name, count in Counter(cell.name for cell in cells).items():
+        if count > 1:
+            raise UserError(f"the plan names {name} {count} times: expected every method, reset and seed once")
     return cells
 
 
@@ -133,10 +139,12 @@ def finished(cell: Cell, folder: Path) -> bool:
     Raises:
       UserError: the folder holds a run of another configuration.
     """
+    from fmpjax import runs
+
     run = folder / cell.name
     if not (run / "config.json").exists():
         return False
-    saved = configuration.flatten(configuration.from_json((run / "config.json").read_text()))
+    saved = configuration.flatten(runs.Run.open(run).config)
     for key, value in configuration.flatten(cell.config).items():
         if saved[key] != value:
             raise UserError(f"{run} holds a run with {key} {saved[key]!r}, not {value!r}: name another --out")
@@ -190,10 +198,11 @@ def run(cells: Sequence[Cell], folder: Path, workers: int = 1, *, together: bool
             now = ", ".join(f"{job.name} {100 * job.share(folder):.0f} %" for job in running.values())
             progress.show(f"{sum(finished(c, folder) for c in todo)} of {len(todo)} done | {now} | {left} left")
     finally:
-        for job in running.values():
-            job.process.send_signal(signal.SIGTERM)
-        for job in running.values():
-            job.process.wait()
+        begun = [job.process for job in running.values() if job.process]
+        for process in begun:
+            process.send_signal(signal.SIGTERM)
+        for process in begun:
+            process.wait()
     if failed:
         names = ", ".join(job.name for job in failed)
         raise UserError(f"{len(failed)} of the cells failed: see {failed[0].log(folder)} ({names})")
@@ -256,7 +265,7 @@ def _jobs(todo: Sequence[Cell], folder: Path, together: bool) -> list[_Job]:
         for job in jobs:
             last = job.cells[-1]
             follows = last.group == cell.group and cell.config.seed == last.config.seed + 1
-            if follows and (_done(last, folder) > 0) == (_done(cell, folder) > 0):
+            if follows and _done(last, folder) == _done(cell, folder):
                 job.cells.append(cell)
                 break
         else:
@@ -280,6 +289,7 @@ import os, sys
 cores = set(map(int, sys.argv[1].split(","))) if sys.argv[1] else set()
 if cores:
     os.sched_setaffinity(0, cores)
+del sys.argv[1]
 from fmpjax.cli import main
-main(sys.argv[2:])
+main(sys.argv[1:])
 """

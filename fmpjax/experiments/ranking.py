@@ -48,7 +48,7 @@ def copies(trainer: Trainer, seed: int = 0) -> dict[str, np.ndarray]:
         "shuffled in time": np.take_along_axis(demonstration, order[..., None], axis=1),
         "noisy (0.1 rad, 1 rad/s)": windows(noisy_qpos, noisy_qvel),
     }
-    return {name: np.asarray(trainer.prior_map(jnp.asarray(value))) for name, value in rows.items()}
+    return {name: np.asarray(trainer.feature_map(jnp.asarray(value))) for name, value in rows.items()}
 
 
 def _frames(trainer: Trainer, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def rank(trainer: Trainer, windows: jax.Array, key: jax.Array, updates: int = 51
     """
     config = trainer.config.prior
     changed = dataclasses.replace(trainer.config, prior=dataclasses.replace(config, updates=updates))
-    prior = priors.make(trainer.config.method, trainer.prior_expert, changed)
+    prior = priors.make(trainer.config.method, trainer.expert, changed)
     init_key, fit_key = jax.random.split(key)
     valid = jnp.ones(windows.shape[:2], bool)
     fit = jax.jit(prior.update)
@@ -111,17 +111,20 @@ def main(run: Path, start: bool = False, last: bool = False, updates: int = 512,
     from fmpjax import runs
 
     opened = runs.Run.open(run)
+    priors.check_potential(opened.config.method)
+    path = out or opened.folder / ("ranking-start.json" if start else "ranking.json")
+    results.check_folder(path.parent)
     if start:
         trainer = opened.trainer()
         policy = trainer.init().ppo
     else:
         trainer, state = opened.policy(best=not last)
         policy = state.ppo
-    played = histories.pool(trainer, policy, trainer.prior_map, jax.random.PRNGKey(0), steps=32 if start else 256)
+    played = histories.pool(trainer, policy, trainer.feature_map, jax.random.PRNGKey(0), steps=32 if start else 256)
     ranking = rank(trainer, played.features, jax.random.PRNGKey(1), updates)
     print(f"pool: {played.valid.size} windows, mean forward speed {played.speed:.3f} m/s")
     print(table(ranking))
-    path = out or opened.folder / ("ranking-start.json" if start else "ranking.json")
+    path.parent.mkdir(parents=True, exist_ok=True)
     runs.write(path, json.dumps({"pool_speed": played.speed, "updates": updates, "windows": ranking}, indent=1))
     print(f"wrote {path}")
 

@@ -34,11 +34,12 @@ class Section(NamedTuple):
     command: str  # that makes it
 
 
-_STUDIES: tuple[tuple[str, ModuleType], ...] = (
-    ("Rewards beyond the rollout that they were fitted on", generalization),
-    ("Dynamic against static path supervision", static_teacher),
-    ("What a barycentric target keeps of the motion", barycenter),
-    ("Where the score has a minimum and the barycentre its maximum", curvature),
+_RUNS = " --run STANDING_RUN --walking WALKING_RUN"
+_STUDIES: tuple[tuple[str, ModuleType, str], ...] = (
+    ("Rewards beyond the rollout that they were fitted on", generalization, _RUNS),
+    ("Dynamic against static path supervision", static_teacher, _RUNS),
+    ("What a barycentric target keeps of the motion", barycenter, ""),
+    ("Where the score has a minimum and the barycentre its maximum", curvature, ""),
 )
 
 
@@ -51,14 +52,16 @@ def gather(folder: Path) -> list[Section]:
     if not folder.is_dir():
         raise UserError(f"{folder} is not a folder: expected one with results of the experiments")
     sections = [
-        _section(folder, "The matched comparison (Table I)", "ablate", COMPARISON, "curves.png", _comparison),
+        _section(folder, "The matched comparison (Table I)", "ablate", "", COMPARISON, "curves.png", _comparison),
         *(
-            _section(folder, title, module.NAME, f"{module.NAME}.json", f"{module.NAME}.png", partial(_study, module))
-            for title, module in _STUDIES
+            _section(
+                folder, title, module.NAME, needs, f"{module.NAME}.json", f"{module.NAME}.png", partial(_study, module)
+            )
+            for title, module, needs in _STUDIES
         ),
     ]
     if not any(section.source for section in sections):
-        names = ", ".join([COMPARISON, *(f"{module.NAME}.json" for _, module in _STUDIES)])
+        names = ", ".join([COMPARISON, *(f"{module.NAME}.json" for _, module, _ in _STUDIES)])
         raise UserError(f"no results below {folder}: expected one of {names}")
     return sections
 
@@ -67,12 +70,13 @@ def _section(
     folder: Path,
     title: str,
     module: str,
+    needs: str,
     name: str,
     picture: str,
     read: Callable[[dict[str, Any]], tuple[Table, list[Verdict]]],
 ) -> Section:
     """The section of the file called ``name`` that lies nearest below ``folder``, with the picture beside it."""
-    command = f"python -m fmpjax.experiments.{module} --out FOLDER"
+    command = f"python -m fmpjax.experiments.{module}{needs} --out FOLDER"
     path = min(folder.rglob(name), key=lambda path: (len(path.parts), path), default=None)
     if path is None:
         return Section(title, None, (), None, None, {}, command)
@@ -80,8 +84,10 @@ def _section(
         record = json.loads(path.read_text())
         drawn = path.with_name(picture)
         shown = drawn if drawn.exists() else None
-        return Section(title, *read(record), shown, path, record["provenance"], command)
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        section = Section(title, *read(record), shown, path, record["provenance"], command)
+        _source(section, folder, str, str)
+        return section
+    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
         raise UserError(
             f"{path} is no result of this version ({type(error).__name__}: {error}): write it anew with {command}"
         ) from None
@@ -152,10 +158,10 @@ def page(sections: Sequence[Section], videos: Sequence[Path], root: Path) -> str
     left = VIDEO_LIMIT
     for path in videos:
         name = html.escape(str(path.relative_to(root)))
-        left -= path.stat().st_size
-        if left < 0:
+        if path.stat().st_size > left:
             parts.append(f'<p class="source">{name} is left out, the page being large enough.</p>')
         else:
+            left -= path.stat().st_size
             shown = f'<video controls muted loop preload="metadata" src="{_data(path, "video/mp4")}"></video>'
             parts.append(f"<figure>{shown}<figcaption>{name}</figcaption></figure>")
     if not videos:

@@ -70,19 +70,17 @@ def save(
 
     Args:
       record: what the JSON file holds; what is not a number there becomes null.
-      rows: lines of the CSV file, all with the same keys.
+      rows: lines of the CSV file; what one lacks stays empty.
       places: folders and files of this machine, of which only the names are kept.
     """
     from fmpjax import runs
 
     out.mkdir(parents=True, exist_ok=True)
     written = json.dumps(_finite({"provenance": runs.provenance(), **record}), indent=1)
-    for place in sorted(map(str, places), key=len, reverse=True):
-        written = written.replace(place, Path(place).name)
-    runs.write(out / f"{name}.json", written)
+    runs.write(out / f"{name}.json", runs.without_places(written, places))
     partial = out / f"{name}.csv.partial"
     with partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
+        writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
         writer.writeheader()
         writer.writerows({k: _cell(v) for k, v in row.items()} for row in rows)
     partial.replace(out / f"{name}.csv")

@@ -21,7 +21,6 @@ import tyro
 
 from fmpjax import features, physics, potential, ppo, priors, runs
 from fmpjax.config import Config, preset
-from fmpjax.errors import UserError
 from fmpjax.evaluate import Evaluator
 from fmpjax.experiments import reference, results
 from fmpjax.priors import flow
@@ -273,8 +272,7 @@ def look(run: tuple[Path, ...], out: Path) -> None:
     rows = []
     for folder in run:
         opened = runs.Run.open(folder)
-        if opened.config.method not in ("fmp", "endpoint", "value"):
-            raise UserError(f"run {folder} is of method {opened.config.method!r}: expected fmp, endpoint or value")
+        priors.check_potential(opened.config.method)
         trainer, state = opened.policy(best=False)
         print(f"{folder}: compiling ...", flush=True)
         row = examine(trainer, state, trainer.config.seed)
@@ -374,7 +372,7 @@ def measure(
     settings = {"preset": preset_name, "motion": Path(motion).name, "frames": frames, "seed": seed, "set": changes}
     evaluation = json.loads(Evaluator(trainer)(state.ppo).to_json())
     record = {"settings": settings, "tracking": tracking, "evaluation": evaluation, "provenance": runs.provenance()}
-    runs.write(out / "standing.json", json.dumps(record, indent=1).replace(motion, Path(motion).name))
+    runs.write(out / "standing.json", runs.without_places(json.dumps(record, indent=1), [motion]))
     print(f"wrote {out}/standing.csv and standing.json")
     print(f"wrote {figure(out / 'standing.png', (out,))}")
 

@@ -124,7 +124,7 @@ def lines(final: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     headings = ["reset", "method", "seeds", *(heading for _, heading, _ in FIGURES), "training, min"]
     body = []
     for (reset, method, variant), rows in _groups(final).items():
-        ours = [_number(*_ordered(interval(r.figures[k] for r in rows), digits)) for k, _, digits in FIGURES]
+        ours = [_cell([r.figures[k] for r in rows], digits) for k, _, digits in FIGURES]
         minutes = np.mean([r.seconds for r in rows]) / 60
         name = title(method, variant)
         body.append([reset, name, str(len(rows)), *ours, f"{minutes:.0f}"])
@@ -134,8 +134,11 @@ def lines(final: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     return headings, body
 
 
-def _ordered(pair: tuple[float, float], digits: int) -> tuple[float, int, float]:
-    return pair[0], digits, pair[1]
+def _cell(values: Sequence[float], digits: int) -> str:
+    """Mean and interval, and of how many seeds where some have no such figure."""
+    mean, half = interval(values)
+    defined = sum(map(math.isfinite, values))
+    return _number(mean, digits, half) + (f" ({defined} of {len(values)})" if 0 < defined < len(values) else "")
 
 
 def markdown(final: Sequence[Row]) -> str:
@@ -267,8 +270,9 @@ def verdicts(final: Sequence[Row]) -> list[Verdict]:
         result.append(
             Verdict(
                 "FMP walks faster than AMP from demonstration resets",
-                f"{fmp['late_speed']:.3f} m/s against {amp['late_speed']:.3f}",
-                fmp["late_speed"] > amp["late_speed"],
+                f"{_pace(fmp)} against {_pace(amp)}",
+                # Where nobody lasts five seconds there is no late speed, which any speed is more than.
+                not math.isnan(fmp["late_speed"]) and not amp["late_speed"] >= fmp["late_speed"],
             )
         )
     for reset in ("dataset", "fixed"):
@@ -287,7 +291,6 @@ def verdicts(final: Sequence[Row]) -> list[Verdict]:
                 "Path supervision makes for fewer falls and more speed from the default pose",
                 f"{fmp['falls']:.1f} % and {_pace(fmp)} against {endpoint['falls']:.1f} % and "
                 f"{_pace(endpoint)} (Endpoint)",
-                # Where nobody lasts five seconds there is no late speed, which any speed is more than.
                 fmp["falls"] < endpoint["falls"]
                 and not math.isnan(fmp["late_speed"])
                 and not endpoint["late_speed"] >= fmp["late_speed"],

@@ -15,6 +15,7 @@ _REGISTRY = {
 }
 METHODS = tuple(_REGISTRY)
 _OWN_NORMALIZER = ("amp",)
+_POTENTIALS = ("fmp", "endpoint", "value")
 
 
 def make(method: str, expert: Expert, config: Config) -> MotionPrior:
@@ -32,6 +33,12 @@ def normalizes(method: str) -> bool:
     return method in _OWN_NORMALIZER
 
 
+def check_potential(method: str) -> None:
+    """Raise a `UserError` unless ``method`` fits a potential to transport."""
+    if method not in _POTENTIALS:
+        raise UserError(f"method is {method!r}: expected one that fits a potential, {', '.join(_POTENTIALS)}")
+
+
 def check(method: str) -> None:
     """Raise a `UserError` unless ``method`` names a prior."""
     if method not in _REGISTRY:
@@ -45,6 +52,7 @@ __all__ = [
     "Reward",
     "Rollout",
     "check",
+    "check_potential",
     "couple",
     "make",
     "median_reward",
