@@ -186,7 +186,8 @@ class Config:
 #   mean pose and the spread of its states, though never a state;
 # - 86 observed numbers that carry what the 237 do: fewer to multiply;
 # - an episode cap that grows from 64 steps to 150, a time-out being no end: docs/learning.md says what either does;
-# - discount 0.97: a median-centred reward pays one a step for mere survival, worth 1/(1 - gamma);
+# - discount 0.97: a median-centred reward pays one a step for mere survival, worth 1/(1 - gamma); lambda 0.9, since a
+#   policy gradient from so small a rollout is mostly noise;
 # - three reward updates a rollout of 4,096: the reward changes little between so small rollouts; the average of the
 #   potential's parameters goes on over rollouts, since three updates are too few to average;
 # - queries from every environment, as few as they are; a floor of 1e-3 under the reward's spread, below which scores
@@ -238,6 +239,7 @@ _LAPTOP: dict[str, Any] = {
     "ppo.actor_epochs": 5,
     "ppo.actor_batch": 8,
     "ppo.discount": 0.97,
+    "ppo.gae_lambda": 0.9,
     "ppo.bound_penalty": 0.0,
     "ppo.normalizer_from_clip": True,
     "ppo.normalizer_count": 2_000_000,
