@@ -147,8 +147,7 @@ class Run:
             )
             for path, (name, _) in zip(self._demonstration_files(len(motions)), motions, strict=True)
         ]
-        total = sum(weight for _, weight in motions)
-        return motion.MotionLibrary(tuple(clips), tuple(weight / total for _, weight in motions))
+        return motion.MotionLibrary(tuple(clips), motion.library.shares(motions))
 
     def motions(self, config: Config) -> list[tuple[str, float]]:
         """Names and weights of the demonstrations; a file's name may hold commas and colons, and the file be gone."""
@@ -391,9 +390,9 @@ def export(run: Run, out: Path) -> list[Path]:
     Raises:
       UserError: ``out`` holds another run's results, or cannot be written.
     """
-    # Where the demonstration and the run lay is this machine's affair; their names are everybody's.
     if out.resolve() == run.folder.resolve():
         raise UserError(f"{out} is the run itself: expected another folder")
+    # Where the demonstration and the run lay is this machine's affair; their names are everybody's.
     places = [*(name for name, _ in run.motions(run.config)), run.folder.resolve(), run.folder]
     texts = {"config.json": (run.folder / "config.json").read_text().rstrip("\n")}
     texts["provenance.json"] = json.dumps(run.provenance(), indent=1)

@@ -47,8 +47,8 @@ def test_a_list_of_names_and_weights():
     assert library.parse("walk") == [("walk", 1.0)]
     assert library.parse("a.npz,b.npz:0.3") == [("a.npz", 1.0), ("b.npz", 0.3)]
     assert library.parse(" walk:2 , turn_left:6 ") == [("walk", 2.0), ("turn_left", 6.0)]
-    assert library.shares("walk:2,turn_left:6") == (0.25, 0.75)
-    np.testing.assert_allclose(library.shares("a,b:0.25"), (0.8, 0.2))
+    assert library.shares(library.parse("walk:2,turn_left:6")) == (0.25, 0.75)
+    np.testing.assert_allclose(library.shares(library.parse("a,b:0.25")), (0.8, 0.2))
 
 
 def test_a_file_with_commas_and_colons_in_its_name_is_a_file(tmp_path, monkeypatch):

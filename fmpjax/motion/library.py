@@ -93,7 +93,7 @@ def load_library(
     clips = tuple(
         load(name, frames=span or None, rate=rate, robot=robot) for (name, _), span in zip(entries, spans, strict=True)
     )
-    return MotionLibrary(clips, shares(names))
+    return MotionLibrary(clips, shares(entries))
 
 
 def parse(names: str) -> list[tuple[str, float]]:
@@ -121,7 +121,7 @@ def parse(names: str) -> list[tuple[str, float]]:
     return entries
 
 
-def shares(names: str) -> tuple[float, ...]:
-    """Weights of a list of motions, summing to one."""
-    weights = [weight for _, weight in parse(names)]
+def shares(entries: list[tuple[str, float]]) -> tuple[float, ...]:
+    """Weights of motions, as `parse` gives them, summing to one."""
+    weights = [weight for _, weight in entries]
     return tuple(weight / sum(weights) for weight in weights)
