@@ -11,6 +11,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 UV := $(shell command -v uv 2>/dev/null)
+install = $(if $(UV),uv pip install --quiet --python $(BIN)/python,$(BIN)/python -m pip install --quiet \
+  --disable-pip-version-check) -c constraints.txt -e
 
 # --name 'value' where the variable is set, nothing where it is not.
 option = $(if $($(1)),--$(2) '$($(1))')
@@ -32,7 +34,8 @@ render: run-is-named $(READY) ## render a run's policy as a video: RUN=runs/walk
 	$(BIN)/fmpjax render '$(RUN)' $(ARGS)
 
 # A file of tests at a time to each of two processes: most of the time is XLA's compiling, which uses one core.
-test: $(READY) ## run every test, in WORKERS processes (2)
+# Warp runs on a CPU too: its tests need it, training does without its 150 MB.
+test: $(READY) $(VENV)/.warp ## run every test, in WORKERS processes (2)
 	$(BIN)/python -m pytest -n $(or $(WORKERS),2) --dist loadfile $(or $(ARGS),-m 'not alone')
 	$(if $(ARGS),,$(BIN)/python -m pytest -m alone)
 
@@ -76,6 +79,9 @@ $(READY): pyproject.toml constraints.txt
 	    "$$found" -m venv $(VENV); \
 	  fi; \
 	fi
-	@if [ -n '$(UV)' ]; then uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '.[dev,viz,retarget]'; \
-	else $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,viz,retarget]'; fi
+	@$(install) '.[dev,viz,retarget]'
+	@touch $@
+
+$(VENV)/.warp: $(READY)
+	@$(install) '.[warp]'
 	@touch $@

@@ -18,7 +18,7 @@ class PhysicsConfig:
     """Simulation between two control steps."""
 
     backend: str = "auto"  # "native" (MuJoCo C on all cores), "mjx" (on the device), "auto": mjx on an accelerator [D]
-    impl: str = "jax"  # implementation of MJX, "jax" or "warp" (NVIDIA only) [D]
+    impl: str = "jax"  # implementation of MJX, "jax" or "warp" (for NVIDIA) [D]
     timestep: float = 0.005  # s, 200 Hz [D]
     substeps: int = 4  # physics steps in a control step, 50 Hz control [P]
     iterations: int = 10  # Newton iterations at most [D]

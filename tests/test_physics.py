@@ -1,6 +1,7 @@
 """The backends against MuJoCo's own step loop and against each other, and the servos against what they promise."""
 
 import dataclasses
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from fmpjax import physics
+from fmpjax import physics, robots
 from fmpjax.config import PhysicsConfig, preset
 from fmpjax.errors import UserError
 from fmpjax.physics import native
@@ -201,10 +202,22 @@ def test_mjx_steps_like_native(robot, states):
         assert position.max() < 1e-4 and velocity.max() < 1e-2, name
 
 
-@pytest.mark.skipif(jax.default_backend() == "gpu", reason="an NVIDIA device may have Warp")
-def test_warp_without_its_device_is_refused(robot):
-    with pytest.raises(UserError, match="'warp': expected an NVIDIA device, found cpu"):
-        physics.make(robot, dataclasses.replace(PAPER, backend="mjx", impl="warp"))
+@pytest.mark.slow
+def test_mjx_advances_seeds_at_once_and_each_on_its_own():
+    """An axis of seeds over the batch changes no world, and targets that have none serve every seed."""
+    small = robots.load("strider")
+    rng = np.random.default_rng(0)
+    qpos = np.stack([small.default_qpos] * 4).astype(np.float32)
+    qvel = 0.3 * rng.normal(size=(4, qpos.shape[1] - 1)).astype(np.float32)
+    targets = jnp.asarray(qpos[:2, 7:] + 0.1 * rng.normal(size=qpos[:2, 7:].shape).astype(np.float32))
+    backend = physics.make(small, dataclasses.replace(LAPTOP, backend="mjx", substeps=1, iterations=4))
+    together = jax.jit(jax.vmap(lambda q, v: backend.step(physics.reset(q, v), targets)))(
+        qpos.reshape(2, 2, -1), qvel.reshape(2, 2, -1)
+    )
+    apart = jax.jit(backend.step)(physics.reset(jnp.asarray(qpos), jnp.asarray(qvel)), jnp.tile(targets, (2, 1)))
+    for a, b in zip(together, apart, strict=True):
+        np.testing.assert_allclose(a.reshape(b.shape), b, rtol=1e-4, atol=1e-4)
+        assert np.abs(b[0] - b[2]).max() > 1e-4
 
 
 def test_auto_is_native_on_a_cpu(robot):
@@ -212,12 +225,51 @@ def test_auto_is_native_on_a_cpu(robot):
     assert physics.make(robot, PhysicsConfig()).name == expected
 
 
-def test_a_world_that_overflows_a_buffer_is_spoilt(robot):
-    """Warp's flags are bits of a world: those that mean lost contacts or constraints make its state not finite."""
-    from fmpjax.physics.mjx import spoil
+# --- Warp, which runs on a CPU too, there in order ------------------------------------------------------------------
 
-    state = physics.reset(jnp.zeros((3, 7)), jnp.zeros((3, 6)))
-    spoilt = jax.vmap(lambda s, flags: spoil(s, flags, 0b1011))(state, jnp.array([0, 0b100, 0b110]))
-    for leaf in spoilt:
-        np.testing.assert_array_equal(np.isnan(leaf).all(-1), [False, False, True])
-        np.testing.assert_array_equal(np.isnan(leaf).any(-1), [False, False, True])
+
+@pytest.fixture(scope="module")
+def warp():
+    pytest.importorskip("warp", reason="fmpjax[warp] is not installed")
+    return dataclasses.replace(PAPER, backend="mjx", impl="warp")
+
+
+@pytest.mark.slow
+def test_warp_steps_like_native(robot, states, warp):
+    """The same states and targets as MJX in JAX gets, three control steps."""
+    ours = advance(physics.make(robot, PAPER), *states, 3)
+    theirs = advance(physics.make(robot, warp), *states, 3)
+    position, velocity = (np.abs(a - b).max(axis=(1, 2)) for a, b in zip(ours[:2], theirs[:2], strict=True))
+    print(f"native and Warp: qpos {position} m or rad, qvel {velocity} m/s or rad/s after each step")
+    assert position.max() < 1e-4 and velocity.max() < 1e-2
+
+
+@pytest.mark.slow
+def test_seeds_in_warp_have_room_for_the_contacts_of_all(robot, states, warp):
+    """Four seeds of one robot that stands, in a buffer that has just room for one robot's contacts."""
+    qpos, qvel, targets = (x[:1] for x in states)
+    backend = physics.make(robot, dataclasses.replace(warp, max_contacts=10))
+    step = jax.jit(jax.vmap(lambda q, v: backend.step(physics.reset(q, v), jnp.asarray(targets))))
+    reached = step(np.stack([qpos] * 4), np.stack([qvel] * 4))
+    alone = backend.step(physics.reset(*map(jnp.asarray, (qpos, qvel))), jnp.asarray(targets))
+    assert np.isfinite(alone.qpos).all()
+    for seed in range(4):
+        np.testing.assert_allclose(reached.qpos[seed], alone.qpos, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_full_buffers_of_warp_show(robot, states, warp, capfd):
+    """Constraints are a world's own; contacts have one buffer, which nobody can say whose loss spoilt."""
+    qpos, qvel, targets = (x[:4] for x in states)  # two stand, two are in the air
+    few = physics.make(robot, dataclasses.replace(warp, max_constraints=40))
+    finite = np.isfinite(advance(few, qpos, qvel, targets, 1).qpos[0]).all(-1)
+    np.testing.assert_array_equal(finite, [False, False, True, True])
+    none = physics.make(robot, dataclasses.replace(warp, max_contacts=1))
+    assert not np.isfinite(advance(none, qpos, qvel, targets, 1).qpos).any()
+    assert "overflow" not in capfd.readouterr().out
+
+
+def test_warp_that_is_not_installed_is_refused(robot, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco.mjx.third_party.mujoco_warp._src.types", None)
+    with pytest.raises(UserError, match=r"'warp': this installation lacks it .*: install fmpjax\[warp\]"):
+        physics.make(robot, dataclasses.replace(PAPER, backend="mjx", impl="warp"))

@@ -1,5 +1,7 @@
 """MJX: the physics on the device, for accelerators."""
 
+from typing import NoReturn
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -13,57 +15,83 @@ from fmpjax.robots import Robot
 
 
 class MjxPhysics:
-    """MJX in JAX (``impl="jax"``) or in Warp (``impl="warp"``, NVIDIA only, not deterministic)."""
+    """MJX in JAX (``impl="jax"``) or in Warp (``impl="warp"``: for NVIDIA, where it is not deterministic)."""
 
     name = "mjx"
 
     def __init__(self, robot: Robot, config: PhysicsConfig):
         self.config = config
         self.model = model(robot, config)
-        if jax.default_backend() == "cpu":
-            # Measured on two cores: the dense Jacobian is seventy times slower there.
-            self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-        if config.impl == "warp" and jax.default_backend() != "gpu":
-            raise UserError("physics.impl is 'warp': expected an NVIDIA device, found " + jax.default_backend())
-        self._overflow = 0  # bits of Warp's word on a world that lost contacts or constraints to a full buffer
-        try:
-            if config.impl == "warp":
-                from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType as Lost
+        self._device = jax.local_devices()[0]  # of several processes each has its own
+        self._overflow = 0  # bits of Warp's word on worlds that lost contacts or constraints to a full buffer
+        if config.impl == "warp":
+            self._model = self._warp_model()
+        else:
+            if self._device.platform == "cpu":
+                # Measured on two cores: the dense Jacobian is seventy times slower there.
+                self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+            # Its line search takes every step it may, in every world: after six it stands where it does after twenty.
+            self.model.opt.ls_iterations = min(config.ls_iterations, 6)
+            # A tolerance made for float64 is never met in float32; Warp has the same floor.
+            self.model.opt.tolerance = max(self.model.opt.tolerance, 1e-6)
+            self._model = mjx.put_model(self.model, impl=config.impl, device=self._device)
 
-                self._overflow = int(Lost.NEFC | Lost.NJMAX_NNZ | Lost.BROADPHASE | Lost.NARROWPHASE)
-            self._model = mjx.put_model(self.model, impl=config.impl)
-            self._data(1)
+        self._step = jax.custom_batching.custom_vmap(self._advance)
+
+        @self._step.def_vmap
+        def _(size, batched, *arguments):
+            # Batches of batches, as seeds make them, are advanced at once: Warp's worlds share a contact buffer,
+            # whose size must be that of them all.
+            whole = [x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(arguments, batched, strict=True)]
+            reached = self._step(*(x.reshape(-1, x.shape[-1]) for x in whole))
+            return tuple(x.reshape(size, -1, x.shape[-1]) for x in reached), (True,) * len(reached)
+
+    def _warp_model(self) -> mjx.Model:
+        # Warp never resets a state that blows up, and refuses the flag that asks it not to.
+        self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        try:
+            from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType as Lost
+
+            built = mjx.put_model(self.model, impl="warp", device=self._device)
+        except NotImplementedError as error:
+            _refuse(f"the robot's model needs what Warp lacks ({error}): expected physics.impl 'jax'")
         except (ImportError, RuntimeError) as error:
-            if config.impl != "warp":
-                raise
-            raise UserError(
-                f"physics.impl is 'warp', which this installation lacks ({error}): install fmpjax[warp]"
-            ) from None
+            _refuse(f"this installation lacks it ({error}): install fmpjax[warp]")
+        except AssertionError:
+            _refuse(f"it runs on an NVIDIA device or a CPU, found {self._device.platform}: expected physics.impl 'jax'")
+        self._overflow = int(Lost.NEFC | Lost.NJMAX_NNZ | Lost.BROADPHASE | Lost.NARROWPHASE)
+        # By default a line is printed for every world whose solver takes all its iterations.
+        return built.tree_replace({"opt._impl.warn_overflow": 0})
 
     def _data(self, count: int) -> mjx.Data:
         """State of one world; Warp's contact buffer is shared by all ``count`` of them."""
         config, buffers = self.config, {}
         if config.impl == "warp":
             buffers = {"naconmax": count * config.max_contacts, "njmax": config.max_constraints}
-        return mjx.make_data(self.model, impl=config.impl, **buffers)
+        return mjx.make_data(self.model, impl=config.impl, device=self._device, **buffers)
 
     def step(self, state: PhysicsState, targets: jax.Array) -> PhysicsState:
-        template = self._data(len(state.qpos))
+        return PhysicsState(*self._step(*state, jnp.asarray(targets, state.qpos.dtype)))
+
+    def _advance(self, *arguments: jax.Array) -> tuple[jax.Array, ...]:
+        template = self._data(len(arguments[0]))
 
         def one(qpos, qvel, warmstart, target):
             data = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=target)
             data, _ = jax.lax.scan(
                 lambda d, _: (mjx.step(self._model, d), None), data, None, length=self.config.substeps
             )
-            reached = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-            # A template's flags are clear, and steps add to them.
-            return spoil(reached, data._impl.overflow, self._overflow) if self._overflow else reached
+            reached = data.qpos, data.qvel, data.qacc_warmstart
+            if not self._overflow:
+                return reached
+            # A template's flags are clear, and steps add to them. What overflowed is reset, and counted.
+            lost = jnp.any(data._impl.overflow & self._overflow)
+            return tuple(jnp.where(lost, jnp.nan, x) for x in reached)
 
         # TF32 in the constraint solver lets contacts sink.
         with jax.default_matmul_precision("highest"):
-            return jax.vmap(one)(*state, jnp.asarray(targets, state.qpos.dtype))
+            return jax.vmap(one)(*arguments)
 
 
-def spoil(state: PhysicsState, flags: jax.Array, bits: int) -> PhysicsState:
-    """The state of one world, not finite where its flags have one of the bits: so it is reset, and counted."""
-    return jax.tree.map(lambda x: jnp.where(jnp.any(flags & bits), jnp.nan, x), state)
+def _refuse(why: str) -> NoReturn:
+    raise UserError(f"physics.impl is 'warp': {why}") from None
