@@ -4,6 +4,7 @@ import dataclasses
 import math
 import os
 import sys
+import time
 import warnings
 from datetime import datetime
 from pathlib import Path
@@ -64,20 +65,19 @@ class Train:
             raise UserError(f"--seeds is {self.seeds}: expected at least 1")
         if self.devices < 0:
             raise UserError(f"--devices is {self.devices}: expected 0 (for all) or more")
+        began = time.monotonic()
         self._connect()
         runs = _runs()
-        from fmpjax import sharding
-
+        devices = None if self.distributed else self.devices or None
         if self.resume:
             group = self._resumed()
             self._extend(group)
         else:
-            # The first process makes the folders, the others find them.
-            group = self._created() if sharding.primary() else None
-            sharding.wait("created")
-            group = group or self._resumed()
-        devices = None if self.distributed else self.devices or None
-        end = runs.train(*group, resume=self.resume, minutes=self.minutes, devices=devices)
+            group = self._begun(devices)
+        minutes = None if self.minutes is None else self.minutes - (time.monotonic() - began) / 60
+        end = runs.train(*group, resume=self.resume, minutes=minutes, devices=devices)
+        from fmpjax import sharding
+
         # Who sends a signal wants the process to end, not to film.
         if end is not runs.End.SIGNAL and sharding.primary():
             for run in group:
@@ -132,13 +132,34 @@ class Train:
                 run.extend(budget)
         sharding.wait("extended")
 
-    def _created(self):
+    def _begun(self, devices: int | None):
+        """New runs: the first process makes the folders, the others find them."""
+        from fmpjax import sharding
+
+        group, refused = None, None
+        try:
+            group = self._created(devices) if sharding.primary() else None
+        except UserError as error:
+            refused = error
+        # Nobody waits for a process that has given up.
+        if not sharding.agree(refused is None):
+            raise refused or UserError("the first process was refused, and says why")
+        sharding.wait("created")
+        return group or self._resumed()
+
+    def _created(self, devices: int | None):
         runs = _runs()
+        from fmpjax import sharding
+
         config = configuration.preset(self.preset or _default_preset(), **self._changes())
         from fmpjax import priors, robots
 
         priors.check(config.method)
         robots.load(config.robot)
+        # Before there is a folder, which the corrected command would find taken.
+        if devices != 1:
+            several = self.seeds if (self.seeds or 1) > 1 else None
+            sharding.check_divides(config.env.count, several, sharding.mesh(devices).size)
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         folder = self.run or Path("runs") / f"{config.method}-{stamp}"
         if self.seeds is None:
@@ -301,6 +322,9 @@ def main(arguments: list[str] | None = None) -> None:
         _refuse(str(error))
     except KeyboardInterrupt:
         sys.exit(130)
+    except BrokenPipeError:  # who reads, `head` say, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except Exception as error:
         if out_of_memory(error):
             _refuse("out of memory: fewer --episodes, or a smaller env.count or evaluation_episodes, need less")

@@ -8,8 +8,12 @@ class UserError(ValueError):
     """
 
 
+# XLA's allocator, a host callback, the CUDA driver and its libraries, Warp.
+_OUT_OF_MEMORY = "RESOURCE_EXHAUSTED", "MemoryError", "OUT_OF_MEMORY", "out of memory", "Failed to allocate"
+
+
 def out_of_memory(error: BaseException) -> bool:
     """Whether an error says that memory ran out, the host's or the device's, at compilation or in a program."""
     return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and any(word in str(error) for word in ("RESOURCE_EXHAUSTED", "MemoryError"))
+        isinstance(error, RuntimeError) and any(word in str(error) for word in _OUT_OF_MEMORY)
     )

@@ -23,7 +23,7 @@ import jax
 import numpy as np
 
 from fmpjax import config as configuration
-from fmpjax import motion, sharding
+from fmpjax import motion, policy, sharding
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import Config
 from fmpjax.errors import UserError, out_of_memory
@@ -56,6 +56,7 @@ class Run:
         self.folder = Path(folder)
         self.checkpoints = Checkpoints(self.folder)
         self._trainer: Trainer | None = None
+        self._evaluator: Evaluator | None = None
 
     @classmethod
     def create(cls, folder: str | Path, config: Config) -> "Run":
@@ -135,6 +136,12 @@ class Run:
             self._trainer = Trainer(config, self._demonstration(config))
         return self._trainer
 
+    def evaluator(self) -> Evaluator:
+        """The run's evaluation, compiled once for training and what comes after."""
+        if self._evaluator is None or self._evaluator.trainer is not self.trainer():
+            self._evaluator = Evaluator(self.trainer())
+        return self._evaluator
+
     def _demonstration_files(self, count: int) -> list[Path]:
         return [self.folder / f"demonstration{f'-{i + 1}' if i else ''}.npz" for i in range(count)]
 
@@ -197,7 +204,9 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
     )
     trainer = _shared_trainer(group)
     states = _start(trainer, group, resume)
-    evaluator = Evaluator(trainer)
+    evaluator = group[0].evaluator()
+    for run in group:
+        run._evaluator = evaluator
     done = int(states[0].iteration)
     if done >= config.iterations:
         progress.note(f"the budget of {config.transitions:,} transitions is spent: a larger --transitions would go on")
@@ -211,7 +220,9 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
     if devices != 1:
         state = trainer.place(state, sharding.mesh(devices))
     chunk = trainer.compile(state)
-    progress.note(f"compiled in {time.monotonic() - compile_began:.0f} s")
+    compiling = time.monotonic() - compile_began
+    progress.note(f"compiled in {compiling:.0f} s")
+    spare = compiling if minutes is not None else 0.0  # s that the last evaluation and save may take
     names = [f"eval/{name}" for name in _evaluation_names()]
     metric_names = sorted(jax.eval_shape(trainer.iteration, states[0])[1])
     logs = [MetricsLog(run.folder, [*metric_names, *names], done, keep=primary) for run in group]
@@ -239,12 +250,15 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
             for run, each in zip(group, states, strict=True):
                 _check_finite(run, each, config)
             # Clocks and signals differ between processes; what follows must not.
-            out_of_time = sharding.agree(minutes is not None and time.monotonic() - began + 1.5 * took > minutes * 60)
+            out_of_time = sharding.agree(
+                minutes is not None and time.monotonic() - began + 1.5 * took + spare > minutes * 60
+            )
             asked = sharding.agree(stop.requested)
             at_milestone = any(done >= m > evaluated for m in milestones)
             # A run that is asked to stop saves and no more, but its last iteration comes only once.
             evaluating = (at_milestone or out_of_time) and (not asked or done >= config.iterations)
             saving = sharding.agree(evaluating or time.monotonic() - saved > _SAVE_INTERVAL)
+            before = time.monotonic()
             # Before the evaluation, after which processes are no longer in step.
             whole = [sharding.on_host(each) for each in states] if saving else []
             for i, (run, log, row) in enumerate(zip(group, logs, rows, strict=True)):
@@ -263,7 +277,10 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
                     _save(run, whole[i], best=True)
                 if saving:
                     _save(run, whole[i])
-            saved = time.monotonic() if saving else saved
+            if saving:
+                saved = time.monotonic()
+            if evaluating:
+                spare = saved - before
             if out_of_time or asked:
                 break
         if not saving:
@@ -364,9 +381,8 @@ def _start(trainer: Trainer, group: Sequence[Run], resume: bool) -> list[TrainSt
 def finish(run: Run) -> list[Path]:
     """Evaluate the run's best policy, and write its table, learning curves and video; the paths written."""
     trainer, state = run.policy()
-    evaluator = Evaluator(trainer)
-    played = evaluator.play(state.ppo)
-    evaluation = evaluator.measure(played)
+    played = run.evaluator().play(state.ppo)
+    evaluation = run.evaluator().measure(played)
     run.save_evaluation(evaluation)
     transitions = int(state.iteration) * trainer.config.transitions_per_iteration
     print(f"best policy, {transitions:,} transitions:\n{table(evaluation)}")
@@ -385,7 +401,7 @@ _EXPORTED = (
 
 
 def export(run: Run, out: Path) -> list[Path]:
-    """Copy what a run has to show, without its states and its demonstration, into ``out``; the paths written.
+    """Copy what a run has to show, and its policy, without states and demonstration, into ``out``; the paths written.
 
     Raises:
       UserError: ``out`` holds another run's results, or cannot be written.
@@ -404,6 +420,9 @@ def export(run: Run, out: Path) -> list[Path]:
         for n, text in texts.items():
             write(out / n, text)
         copied = [Path(shutil.copy2(run.folder / n, out / n)) for n in _EXPORTED if (run.folder / n).exists()]
+        if run.checkpoints.iterations() or run.checkpoints.iterations(best=True):
+            trainer, state = run.policy()
+            copied.append(policy.save(out / "policy.npz", policy.of(trainer, state.ppo)))
         return [*(out / n for n in texts), *copied]
     except OSError as error:
         raise UserError(f"folder {out} cannot be written: {error.strerror}") from None
@@ -514,7 +533,9 @@ def _check_finite(run: Run, state: TrainState, config: Config) -> None:
     if count <= config.nonfinite_limit:
         return
     path = run.folder / "nonfinite_state.npz"
-    np.savez(path, **{name: np.asarray(value) for name, value in state.env.offender._asdict().items()})
+    offender = sharding.on_host(state.env.offender._asdict())
+    if sharding.primary():
+        np.savez(path, **offender)
     physics = config.physics
     full = f" or greater max_contacts (now {physics.max_contacts}) and max_constraints (now {physics.max_constraints})"
     raise UserError(

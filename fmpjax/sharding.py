@@ -31,6 +31,17 @@ def mesh(count: int | None = None) -> Mesh:
     return Mesh(np.array(devices[:count]), (AXIS,), axis_types=(AxisType.Auto,))
 
 
+def check_divides(environments: int, seeds: int | None, devices: int) -> None:
+    """What devices share: the seeds where a run has several, else the environments.
+
+    Raises:
+      UserError: they do not divide.
+    """
+    what, count = ("the number of seeds", seeds) if seeds else ("setting env.count", environments)
+    if count % devices:
+        raise UserError(f"{what} is {count}: expected a multiple of {devices}, the devices that share them")
+
+
 def connect(coordinator: str | None, processes: int | None, process: int | None) -> None:
     """Join the other processes of a run; to be called before any other use of JAX.
 

@@ -134,10 +134,8 @@ class Trainer:
         Raises:
           UserError: they do not divide.
         """
-        devices, seeds = over.size, len(state.iteration) if state.iteration.ndim else 0
-        what, count = ("the number of seeds", seeds) if seeds else ("setting env.count", self.config.env.count)
-        if count % devices:
-            raise UserError(f"{what} is {count}: expected a multiple of {devices}, the devices that share them")
+        seeds = len(state.iteration) if state.iteration.ndim else None
+        sharding.check_divides(self.config.env.count, seeds, over.size)
         if seeds:
             return jax.device_put(state, sharding.rows(over))
         split = {name: jax.device_put(getattr(state.env, name), sharding.rows(over)) for name in PER_ENVIRONMENT}

@@ -92,7 +92,11 @@ def test_bad_devices(tmp_path, capsys):
         t.place(t.init(), sharding.mesh(3))
     with pytest.raises(UserError, match="the number of seeds is 2: expected a multiple of 4"):
         t.place(stack([t.init(0), t.init(1)]), sharding.mesh(4))
+    run = ["--preset", "smoke", "--run", str(tmp_path / "run")]
     for arguments, message in (
+        ([*run, "--devices", "9"], "--devices is 9: expected 1 to 4, the devices that JAX sees"),
+        ([*run, "--devices", "4", "--set", "env.count=6"], "setting env.count is 6: expected a multiple of 4"),
+        ([*run, "--devices", "4", "--seeds", "2"], "the number of seeds is 2: expected a multiple of 4"),
         (["--devices", "-1"], "--devices is -1: expected 0 (for all) or more"),
         (["--processes", "2"], "--coordinator, --processes and --process go with --distributed"),
         (["--distributed"], "--distributed needs the run's folder"),
@@ -101,15 +105,51 @@ def test_bad_devices(tmp_path, capsys):
             cli.main(["train", *arguments])
         assert exit_info.value.code == 2
         assert message in capsys.readouterr().err
+    # Nothing that the corrected command would find in its way.
+    assert not (tmp_path / "run").exists()
+
+
+def free_address():
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        return f"localhost:{free.getsockname()[1]}"
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_every_process_has_the_physics_on_a_device_of_its_own():
+    program = """
+import sys
+from fmpjax import sharding
+sharding.connect(sys.argv[1], 2, int(sys.argv[2]))
+import jax, jax.numpy as jnp
+from fmpjax import physics, robots
+from fmpjax.config import preset
+robot = robots.load("unitree_g1")
+backend = physics.make(robot, preset("smoke", **{"physics.backend": "mjx"}).physics)
+qpos = jnp.asarray(robot.default_qpos)[None]
+jax.jit(backend.step).lower(physics.reset(qpos, jnp.zeros((1, 35))), qpos[:, 7:])
+(device,) = jax.tree.leaves(backend._model)[0].devices()
+print("process", jax.process_index(), "of", jax.process_count(), "has", device.process_index)
+"""
+    address = free_address()
+    pair = [
+        subprocess.Popen(
+            [sys.executable, "-c", program, address, str(i)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        for i in range(2)
+    ]
+    said = [process.communicate(timeout=200) for process in pair]
+    assert [process.returncode for process in pair] == [0, 0], said
+    for i in range(2):
+        assert f"process {i} of 2 has {i}" in said[i][0]
 
 
 @pytest.mark.slow
 @pytest.mark.alone
 def test_two_processes_are_one(tmp_path):
     """The same run by two processes with two devices each and by one with one: metrics, and a checkpoint to go on."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        address = f"localhost:{free.getsockname()[1]}"
+    address = free_address()
     short = {"transitions": 8 * 8 * 4, "evaluations": (1.0,)}
     planned, common = tiny(**short), ["train", "--preset", "smoke", *settings(TINY | short)]
     joined = ["--run", tmp_path / "two", "--distributed", "--coordinator", address, "--processes", 2]

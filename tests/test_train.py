@@ -6,6 +6,7 @@ import fcntl
 import json
 import logging
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -20,7 +21,7 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event
 
 import fmpjax
-from fmpjax import cli, config, runs
+from fmpjax import cli, config, policy, runs
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import preset
 from fmpjax.errors import UserError
@@ -129,6 +130,32 @@ def test_the_program_is_compiled_exactly_once(trained, compiled_programs):
 
 
 @pytest.mark.slow
+def test_the_state_is_given_to_the_program(trainer):
+    """The compiled chunk writes its state into the buffers of the one before."""
+    state = trainer.init()
+    program = trainer.compile(state)
+    assert program.memory_analysis().alias_size_in_bytes > 0.9 * sum(x.nbytes for x in jax.tree.leaves(state))
+
+
+@pytest.mark.slow
+def test_the_paper_s_program_never_leaves_the_device(walk):
+    """Lowered for an NVIDIA device, an iteration of ``paper`` with MJX has no call to the host; a CPU's has one."""
+    few = {"transitions": 8 * 32, "env.count": 8, "prior.bank": 16, "prior.minibatch": 16, "ppo.hidden": (16,)}
+
+    def lowered(backend, platform):
+        trainer = Trainer(preset("paper", **few, **{"physics.backend": backend}), walk)
+        traced = jax.jit(trainer.iteration).trace(trainer.init())
+        return traced.lower(lowering_platforms=(platform,)).as_text()
+
+    assert "callback" in lowered("native", "cpu")
+    program = lowered("mjx", "cuda")
+    assert "callback" not in program
+    # What it calls that is no StableHLO: sorting, linear algebra and random bits of the device's own.
+    called = set(re.findall(r"custom_call @(\w+)", program))
+    assert called <= {"Sharding", "cu_threefry2x32_ffi", "cusolver_potrf_ffi", "cublas_trsm"}, called
+
+
+@pytest.mark.slow
 def test_metrics_have_a_row_a_chunk(trained):
     found = rows(trained)
     assert [int(r["iteration"]) for r in found] == [2, 4, 6, 8, 10]
@@ -188,6 +215,19 @@ def test_finish_writes_evaluation_curves_and_video(trained):
 
 
 # --- interruptions ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_an_export_carries_the_best_policy(trained, tmp_path):
+    run = runs.Run.open(trained)
+    written = runs.export(run, tmp_path / "out")
+    assert tmp_path / "out" / "policy.npz" in written
+    trainer, state = run.policy()
+    observations = trainer.env.clip_observations[:5]
+    actions, _ = trainer.ppo.act(state.ppo, deterministic=True)(observations, None)
+    loaded = policy.load(tmp_path / "out" / "policy.npz")
+    np.testing.assert_allclose(loaded(observations), trainer.env.actions(actions), atol=2e-5)
+    assert sum(path.stat().st_size for path in written if path.name == "policy.npz") < 1e6
 
 
 @pytest.mark.slow

@@ -1,0 +1,93 @@
+"""A trained policy by itself: one small file, and NumPy to run it, away from the training stack."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from fmpjax.errors import UserError
+
+if TYPE_CHECKING:
+    from fmpjax.ppo import PPOState
+    from fmpjax.train import Trainer
+
+_ACTIVATIONS = {
+    "relu": lambda x: np.maximum(x, 0.0),
+    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0.0))),
+    "swish": lambda x: x / (1.0 + np.exp(-x)),
+    "tanh": np.tanh,
+}
+
+
+class Policy(NamedTuple):
+    """The mean action of a trained policy, as joint targets."""
+
+    joint_names: tuple[str, ...]  # J, the order of targets
+    observation: str  # "compact" or "full", what `features.observe` makes
+    rate: float  # Hz, of control
+    activation: str
+    kernels: tuple[np.ndarray, ...]  # of the layers, [in, out]
+    biases: tuple[np.ndarray, ...]  # [out]
+    mean: np.ndarray  # [O], of the observations in training
+    deviation: np.ndarray  # [O]
+    clip: float  # of normalised observations
+    center: np.ndarray  # [J] rad, the targets of action zero
+    scale: np.ndarray  # [J] rad, a unit of action
+    low: np.ndarray  # [J] rad, of the targets
+    high: np.ndarray  # [J] rad
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Joint targets ``[..., J]`` (rad), for the servos to hold, from observations ``[..., O]``."""
+        x = np.clip((observation - self.mean) / self.deviation, -self.clip, self.clip)
+        for kernel, bias in zip(self.kernels[:-1], self.biases[:-1], strict=True):
+            x = _ACTIVATIONS[self.activation](x @ kernel + bias)
+        action = x @ self.kernels[-1] + self.biases[-1]
+        return np.clip(self.center + self.scale * action, self.low, self.high)
+
+
+def of(trainer: "Trainer", state: "PPOState") -> Policy:
+    """The policy of a training state."""
+    config, robot, actions = trainer.config, trainer.robot, trainer.env.actions
+    networks = state.actor["params"]
+    hidden = [networks["MLP_0"][f"hidden_{i}"] for i in range(len(config.ppo.hidden))]
+    layers = [*hidden, networks["Dense_0"]]
+    return Policy(
+        joint_names=tuple(robot.joint_names),
+        observation=config.env.observation,
+        rate=float(config.control_rate),
+        activation=config.ppo.activation,
+        kernels=tuple(np.asarray(layer["kernel"]) for layer in layers),
+        biases=tuple(np.asarray(layer["bias"]) for layer in layers),
+        mean=np.asarray(state.normalizer.mean),
+        deviation=np.asarray(state.normalizer.std),
+        clip=float(config.ppo.normalizer_clip),
+        **{name: np.asarray(value, np.float32) for name, value in actions._asdict().items()},
+    )
+
+
+def save(path: Path, policy: Policy) -> Path:
+    """Write a policy as ``.npz``, a layer's arrays each on their own; the path written."""
+    arrays = policy._asdict()
+    for name in ("kernels", "biases"):
+        arrays |= {f"{name}.{i}": array for i, array in enumerate(arrays.pop(name))}
+    np.savez(path, **arrays)
+    return path
+
+
+def load(path: str | Path) -> Policy:
+    """Read what `save` wrote.
+
+    Raises:
+      UserError: the file is missing or is no policy.
+    """
+    try:
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files}
+        layers = range(sum(name.startswith("kernels.") for name in arrays))
+        for name in ("kernels", "biases"):
+            arrays[name] = tuple(arrays.pop(f"{name}.{i}") for i in layers)
+        arrays |= {name: arrays[name].item() for name in ("observation", "rate", "activation", "clip")}
+        arrays["joint_names"] = tuple(map(str, arrays["joint_names"]))
+        return Policy(**arrays)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} is not a policy ({error}): expected policy.npz as `fmpjax export` writes it") from None

@@ -1,0 +1,42 @@
+"""The exported policy against the networks that it was taken from."""
+
+import jax
+import numpy as np
+import pytest
+from test_train import tiny
+
+from fmpjax import motion, policy
+from fmpjax.errors import UserError
+from fmpjax.train import Trainer
+
+
+@pytest.mark.parametrize(
+    ("observation", "action", "activation"),
+    [("compact", "residual", "elu"), ("full", "absolute", "relu"), ("compact", "absolute", "swish")],
+)
+def test_numpy_says_what_the_networks_say(tmp_path, observation, action, activation):
+    changes = {"env.observation": observation, "env.action": action, "ppo.activation": activation}
+    trainer = Trainer(tiny(**changes, **{"ppo.hidden": (16, 12), "ppo.mean_init": 0.5}), motion.load("walk"))
+    state = trainer.init().ppo
+    observations = trainer.env.clip_observations[::20]
+    # The running statistics of a policy that has seen something else than the clip alone.
+    state = state._replace(normalizer=trainer.ppo.observe(state.normalizer, 2.0 * observations))
+    actions, _ = trainer.ppo.act(state, deterministic=True)(observations, jax.random.PRNGKey(0))
+    loaded = policy.load(policy.save(tmp_path / "policy.npz", policy.of(trainer, state)))
+    targets = loaded(observations)
+    np.testing.assert_allclose(targets, trainer.env.actions(actions), atol=2e-5)
+    assert targets.std(0).max() > 1e-3
+    np.testing.assert_allclose(loaded(observations[3]), targets[3], atol=1e-6)
+    assert loaded.joint_names == tuple(trainer.robot.joint_names)
+    assert (loaded.observation, loaded.activation, loaded.rate) == (observation, activation, 50.0)
+
+
+@pytest.mark.parametrize("content", [None, b"not an archive", "other"])
+def test_what_is_no_policy_is_refused(tmp_path, content):
+    path = tmp_path / "policy.npz"
+    if content == "other":
+        np.savez(path, qpos=np.zeros(3))
+    elif content:
+        path.write_bytes(content)
+    with pytest.raises(UserError, match=r"policy.npz is not a policy .*: expected policy.npz as `fmpjax export`"):
+        policy.load(path)
