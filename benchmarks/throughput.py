@@ -1,7 +1,8 @@
 """How many transitions a second does training make, where does the time go, and what is the least it could take?
 
 Cases are numbers of environments, seeds and devices. Each is the whole program as a run calls it, iterations scanned
-and compiled, and all are timed in turn, round after round, so that a noisy machine disturbs them alike. Beside a case
+and compiled. On a CPU all are timed in turn, round after round, so that a noisy machine disturbs them alike; on an
+accelerator, whose memory they would share, one after the other, and the table is written after each. Beside a case
 stand its parts, compiled one by one and timed on the state that it reached: physics alone (on a CPU `mujoco.rollout`
 without JAX), the rest of the rollout, features, fitting, scoring, PPO.
 
@@ -29,6 +30,7 @@ import numpy as np
 
 CALL = 30_000  # transitions in a call of the compiled program, about
 PEAK, COPY = 2048, 2**26  # side of the square product, floats of the copy that measure the machine
+AGAIN = 32  # times that an accelerator, which takes microseconds, does either
 
 # --- counting what a program executes --------------------------------------------------------------------------------
 
@@ -155,11 +157,16 @@ def peaks() -> tuple[Callable[[], float], Callable[[], float]]:
     import jax
     import jax.numpy as jnp
 
-    a, x = jnp.ones((PEAK, PEAK)), jnp.ones(COPY)
-    multiply, copy = jax.jit(lambda a: a @ a), jax.jit(lambda x: x + 1)
+    again, side = (1, PEAK) if jax.default_backend() == "cpu" else (AGAIN, 4 * PEAK)
+    a, x = jnp.full((side, side), 1 / side), jnp.ones(COPY)
+    multiply = jax.jit(lambda a: jax.lax.fori_loop(0, again, lambda _, b: a @ b, a))
+    copy = jax.jit(lambda x: jax.lax.fori_loop(0, again, lambda _, y: y + 1, x))
     for call, of in ((multiply, a), (copy, x)):
         jax.block_until_ready(call(of))
-    return lambda: 2.0 * PEAK**3 / seconds(lambda: multiply(a)), lambda: 8.0 * COPY / seconds(lambda: copy(x))
+    return (
+        lambda: 2.0 * again * side**3 / seconds(lambda: multiply(a)),
+        lambda: 8.0 * again * COPY / seconds(lambda: copy(x)),
+    )
 
 
 class Part(NamedTuple):
@@ -296,8 +303,11 @@ def settings_of(arguments, environments: int, seeds: int = 1):
     return config.preset(arguments.preset, **({"chunk": chunk} | changes))
 
 
-def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Lines of the table: a case's whole iteration, then its parts; prints them."""
+def measure(arguments: argparse.Namespace, group: list[tuple[int, int, int]], first_s: float) -> list[dict[str, Any]]:
+    """Lines of the table for some cases, timed in turn: a case's whole iteration, then its parts; prints them.
+
+    ``first_s`` is the first case's time of a transition, or 0 where that is among these.
+    """
     import jax
 
     from fmpjax import motion, runs
@@ -306,7 +316,7 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     settings = settings_of(arguments, 0)
     clip = motion.load(settings.motion, rate=settings.control_rate, robot=settings.robot)
     cases: list[Case] = []
-    for which in itertools.product(arguments.environments, arguments.seeds, arguments.devices):
+    for which in group:
         try:
             cases.append(prepare(arguments, clip, *which))
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
@@ -327,17 +337,18 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         pieces.append([[seconds(each.call) for each in case.parts.values()] for case in cases])
     flop_rate, byte_rate = np.median(rates, axis=0)
     first = cases[0].trainer
-    print(
-        f"{arguments.preset} on {runs.machine()}: {first.env.physics.name} physics at "
-        f"{1 / first.config.physics.timestep:.0f} Hz, {first.config.prior.updates} reward updates; products at "
-        f"{flop_rate / 1e9:,.0f} GFLOP/s, copies at {byte_rate / 1e9:,.1f} GB/s"
-    )
+    if not first_s:
+        print(
+            f"{arguments.preset} on {runs.machine()}: {first.env.physics.name} physics at "
+            f"{1 / first.config.physics.timestep:.0f} Hz, {first.config.prior.updates} reward updates; products at "
+            f"{flop_rate / 1e9:,.0f} GFLOP/s, copies at {byte_rate / 1e9:,.1f} GB/s"
+        )
     wholes, lines = np.array(wholes), []
     for i, case in enumerate(cases):
         per_iteration = case.transitions / case.trainer.config.chunk
         whole = float(np.median(wholes[:, i]))
         relative = wholes[:, i] / per_iteration
-        base = wholes[:, 0] / (cases[0].transitions / first.config.chunk)
+        base = first_s or wholes[:, 0] / (cases[0].transitions / first.config.chunk)
         head = case.row | {"part": "iteration", "ms": 1e3 * whole, "transitions_per_s": per_iteration / whole}
         lines.append(head | {"to_the_first": float(np.median(base / relative))})
         show(lines[-1])
@@ -426,14 +437,24 @@ def main() -> None:
     # A device that waits for the others holds one of XLA's threads, one a core: too few are a deadlock.
     if max(arguments.devices) > 1:
         os.environ.setdefault("NPROC", str(2 * max(os.cpu_count() or 1, *arguments.devices)))
-    lines = measure(arguments)
-    if arguments.csv and lines:
-        with open(arguments.csv, "w", newline="") as file:
+    import jax
+
+    cases = list(itertools.product(arguments.environments, arguments.seeds, arguments.devices))
+    lines: list[dict[str, Any]] = []
+    for group in [cases] if jax.default_backend() == "cpu" else [[case] for case in cases]:
+        lines += measure(arguments, group, 1 / lines[0]["transitions_per_s"] if lines else 0.0)
+        write(lines, arguments.csv, arguments.png)
+
+
+def write(lines: list[dict[str, Any]], table: str | None, picture: str | None) -> None:
+    """The table and the curves so far."""
+    if table and lines:
+        with open(table, "w", newline="") as file:
             writer = csv.DictWriter(file, dict.fromkeys(key for line in lines for key in line))
             writer.writeheader()
             writer.writerows({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in line.items()} for line in lines)
-    if arguments.png and lines:
-        plot(lines, arguments.png)
+    if picture and lines:
+        plot(lines, picture)
 
 
 if __name__ == "__main__":
