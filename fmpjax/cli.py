@@ -141,10 +141,9 @@ class Train:
             group = self._created(devices) if sharding.primary() else None
         except UserError as error:
             refused = error
-        # Nobody waits for a process that has given up.
+        # The others wait here for the folders, and no longer than for a first process that has given up.
         if not sharding.agree(refused is None):
             raise refused or UserError("the first process was refused, and says why")
-        sharding.wait("created")
         return group or self._resumed()
 
     def _created(self, devices: int | None):
@@ -158,8 +157,7 @@ class Train:
         robots.load(config.robot)
         # Before there is a folder, which the corrected command would find taken.
         if devices != 1:
-            several = self.seeds if (self.seeds or 1) > 1 else None
-            sharding.check_divides(config.env.count, several, sharding.mesh(devices).size)
+            sharding.check_divides(config.env.count, self.seeds or 1, sharding.mesh(devices).size)
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         folder = self.run or Path("runs") / f"{config.method}-{stamp}"
         if self.seeds is None:

@@ -222,7 +222,7 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
     chunk = trainer.compile(state)
     compiling = time.monotonic() - compile_began
     progress.note(f"compiled in {compiling:.0f} s")
-    spare = compiling if minutes is not None else 0.0  # s that the last evaluation and save may take
+    spare = compiling  # s that the last evaluation and save may take
     names = [f"eval/{name}" for name in _evaluation_names()]
     metric_names = sorted(jax.eval_shape(trainer.iteration, states[0])[1])
     logs = [MetricsLog(run.folder, [*metric_names, *names], done, keep=primary) for run in group]

@@ -31,13 +31,13 @@ def mesh(count: int | None = None) -> Mesh:
     return Mesh(np.array(devices[:count]), (AXIS,), axis_types=(AxisType.Auto,))
 
 
-def check_divides(environments: int, seeds: int | None, devices: int) -> None:
+def check_divides(environments: int, seeds: int, devices: int) -> None:
     """What devices share: the seeds where a run has several, else the environments.
 
     Raises:
       UserError: they do not divide.
     """
-    what, count = ("the number of seeds", seeds) if seeds else ("setting env.count", environments)
+    what, count = ("the number of seeds", seeds) if seeds > 1 else ("setting env.count", environments)
     if count % devices:
         raise UserError(f"{what} is {count}: expected a multiple of {devices}, the devices that share them")
 

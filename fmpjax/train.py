@@ -134,9 +134,9 @@ class Trainer:
         Raises:
           UserError: they do not divide.
         """
-        seeds = len(state.iteration) if state.iteration.ndim else None
+        seeds = len(state.iteration) if state.iteration.ndim else 1
         sharding.check_divides(self.config.env.count, seeds, over.size)
-        if seeds:
+        if seeds > 1:
             return jax.device_put(state, sharding.rows(over))
         split = {name: jax.device_put(getattr(state.env, name), sharding.rows(over)) for name in PER_ENVIRONMENT}
         state = jax.device_put(state, sharding.everywhere(over))

@@ -12,7 +12,12 @@ from fmpjax.train import Trainer
 
 @pytest.mark.parametrize(
     ("observation", "action", "activation"),
-    [("compact", "residual", "elu"), ("full", "absolute", "relu"), ("compact", "absolute", "swish")],
+    [
+        ("compact", "residual", "elu"),
+        ("full", "absolute", "relu"),
+        ("compact", "absolute", "swish"),
+        ("full", "residual", "tanh"),
+    ],
 )
 def test_numpy_says_what_the_networks_say(tmp_path, observation, action, activation):
     changes = {"env.observation": observation, "env.action": action, "ppo.activation": activation}
