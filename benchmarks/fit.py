@@ -90,7 +90,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     settings = config.preset("paper")
-    clip = motion.load(settings.motion, rate=settings.control_rate)
+    clip = motion.load(settings.motion, rate=settings.control_rate, robot=settings.robot)
     trainer = Trainer(settings, clip)
     windows, fitted = trainer.expert.windows, settings.prior
     dimension, size = trainer.feature_map.dimension, windows.shape[-1]

@@ -43,7 +43,7 @@ def main() -> None:
             except UserError as error:
                 print(f"{batch:>7}  {name:<10} left out: {error}")
                 continue
-            clip = motion.load(settings.motion, rate=settings.control_rate)
+            clip = motion.load(settings.motion, rate=settings.control_rate, robot=settings.robot)
             env = Env(robot, clip, settings, backend)
             start = env.start_at(env.reset_rows(jax.random.PRNGKey(0), batch)).physics
             targets = jnp.broadcast_to(env.actions(jnp.zeros(robot.joint_count)), (batch, robot.joint_count))

@@ -82,7 +82,7 @@ def main() -> None:
 
     settings = config.preset(arguments.preset, **{"physics.backend": "native", "env.first_cap": 500})
     robot = robots.load(settings.robot)
-    clip = motion.load(settings.motion, rate=settings.control_rate)
+    clip = motion.load(settings.motion, rate=settings.control_rate, robot=settings.robot)
     backend = physics.make(robot, settings.physics)
     assert isinstance(backend, NativePhysics)
     env = Env(robot, clip, settings, backend)

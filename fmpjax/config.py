@@ -25,7 +25,7 @@ class PhysicsConfig:
     ls_iterations: int = 20  # line-search iterations at most [D]
     frictionloss: float = 0.1  # N m, joint friction [M]
     threads: int = 0  # threads of the native backend, 0 for every core [D]
-    max_contacts: int = 24  # contacts of one world, twice what a robot here can have, in the buffers of impl="warp" [D]
+    max_contacts: int = 24  # contacts of one world that MJX keeps: the nearest, or those that Warp finds first [D]
     max_constraints: int = 256  # constraint rows of one world in the buffers of impl="warp" [D]
 
 
@@ -35,6 +35,8 @@ class EnvConfig:
 
     count: int = 1024  # parallel environments [P]
     reset: str = "dataset"  # "dataset" (a demonstration state) or "fixed" (the default pose) [P]
+    demonstration_parts: int = 8  # times per control step at which the demonstration is read; 1: samples [M: any time]
+    early_frames: bool = True  # windows may begin before the demonstration, its first frame standing in [M]
     reset_noise: float = 0.0  # rad, deviation of joint angles at a training reset; ten times that in rad/s [D: none]
     episode_steps: int = 500  # control steps, 10 s [P]
     first_cap: int = 500  # episode cap at the start; below episode_steps it grows as episodes survive [P: 500]
@@ -143,11 +145,12 @@ class Config:
     """One run."""
 
     method: str = "fmp"
-    robot: str = "unitree_g1"
+    robot: str = "unitree_g1_29dof"  # [M]
     motion: str = "walk"  # a bundled motion's name or a file; several as NAME[:WEIGHT],NAME[:WEIGHT]
     frames: str = ""  # source rows "first:last" of the motion, both included; empty for all
     preset: str = "paper"
     seed: int = 0
+    precision: str = "float32"  # of the networks' matrix products [M]; "default" is TF32 on NVIDIA
     transitions: int = 50_003_968  # budget [P]
     # Simulation goes on through an evaluation, where the paper's starts anew [D].
     evaluations: tuple[float, ...] = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)  # shares of the budget at which to evaluate [P]
@@ -199,6 +202,8 @@ class Config:
 #   a residual that is too large is clipped at the joint's range;
 # - AMP with Adam, a smaller network and replay, and as many updates and samples in each as the potential has.
 _LAPTOP: dict[str, Any] = {
+    "robot": "unitree_g1",
+    "precision": "default",
     "transitions": 6_000_000,
     "evaluations": (0.2, 0.3, 0.4, 0.55, 0.7, 0.85, 1.0),
     "evaluation_episodes": 256,
@@ -211,6 +216,8 @@ _LAPTOP: dict[str, Any] = {
     "env.count": 128,
     "env.first_cap": 64,
     "env.last_cap": 150,
+    "env.demonstration_parts": 1,
+    "env.early_frames": False,
     "env.observation": "compact",
     "env.action": "residual",
     "features.deviation_floor": 0.05,
@@ -328,9 +335,13 @@ def to_json(config: Config) -> str:
     return json.dumps(flatten(config), indent=1)
 
 
+# What settings were before they existed, where that is not the default: what an older file without them means.
+_BEFORE: dict[str, Any] = {"precision": "default", "env.demonstration_parts": 1, "env.early_frames": False}
+
+
 def from_json(text: str) -> Config:
     """The configuration that `to_json` wrote."""
-    return validate(with_changes(Config(), json.loads(text)))
+    return validate(with_changes(Config(), {**_BEFORE, **json.loads(text)}))
 
 
 _CHOICES = {
@@ -342,10 +353,12 @@ _CHOICES = {
     "physics.backend": ("auto", "native", "mjx"),
     "physics.impl": ("jax", "warp"),
     "ppo.optimizer": ("sgd", "adam"),
+    "precision": ("float32", "default"),
     "ppo.activation": ("relu", "elu", "swish", "tanh"),
 }
 _POSITIVE = (
-    "transitions env.count env.episode_steps env.first_cap ppo.rollout_steps physics.timestep physics.substeps "
+    "transitions env.count env.demonstration_parts env.episode_steps env.first_cap ppo.rollout_steps "
+    "physics.timestep physics.substeps "
     "features.deviation_floor features.angular_velocity_floor features.clip prior.bank prior.minibatch "
     "prior.updates prior.learning_rate ppo.learning_rate ppo.deviation chunk evaluation_episodes "
     "prior.spread_floor prior.value_scale env.last_cap prior.score_banks prior.temperature amp.updates "

@@ -6,6 +6,7 @@ indices point at the demonstration's own preceding frames, or repeat the default
 construction.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from fmpjax import features, physics, sharding
 from fmpjax.config import Config
 from fmpjax.features import Observed
 from fmpjax.motion import MotionClip, MotionLibrary
+from fmpjax.motion.clip import refined
 from fmpjax.robots import Robot
 
 # Faster than any joint or fall of a robot of this size, rad/s or m/s: such a state has blown up.
@@ -99,10 +101,17 @@ class Env:
     def __init__(self, robot: Robot, motion: MotionClip | MotionLibrary, config: Config, backend: physics.Physics):
         self.robot, self.config, self.physics = robot, config.env, backend
         self.horizon = config.features.history
-        self.library = library = MotionLibrary.of(motion)
+        library = MotionLibrary.of(motion)
         self.actions = action_map(robot, library, config.env.action)
         observe = jax.jit(lambda qpos, qvel: features.observe(robot, qpos, qvel, config.env.observation))
         self._observe = observe
+        # A row stands `stride` rows after the frame before it.
+        self.stride = config.env.demonstration_parts
+        self.library = library = dataclasses.replace(
+            library, clips=tuple(refined(clip, self.stride) for clip in library.clips)
+        )
+        # Rows of its clip that a row needs ahead of it to end a window.
+        self._before = 0 if config.env.early_frames else (self.horizon - 1) * self.stride
         # Rows 0..M-1 are the demonstrations, row M the default pose; resets gather from here.
         self._qpos = np.concatenate([library.qpos, robot.default_qpos[None]]).astype(np.float32)
         self._qvel = np.concatenate([library.qvel, np.zeros_like(library.qvel[:1])]).astype(np.float32)
@@ -120,25 +129,36 @@ class Env:
 
     def clip_windows(self) -> jax.Array:
         """The demonstrations' windows of compact frames, ``[W, H, F]``."""
-        starts = self.library.window_starts(self.horizon)
-        return jnp.asarray(self._table.frame)[starts[:, None] + np.arange(self.horizon)]
+        return jnp.asarray(self._table.frame)[self.history_rows(self.library.rows_after(self._before))]
+
+    def window_share(self) -> np.ndarray | None:
+        """How often each of those windows is drawn, ``[W]``, summing to one; None where all are alike."""
+        return self.library.share_after(self._before)
+
+    def clip_of(self, rows: np.ndarray) -> np.ndarray:
+        """Index of the demonstration of each table row, 0 for the default pose."""
+        return np.where(rows < self.clip_rows, self.library.clip_of(rows), 0)
 
     def reset_rows(self, key: jax.Array, count: int) -> jax.Array:
         """Table rows ``[count]`` at which episodes start under the configured regime."""
         if self.config.reset == "fixed":
             return jnp.full((count,), self.clip_rows)
         if len(self.library.clips) == 1:
-            return jax.random.randint(key, (count,), self.horizon - 1, self.clip_rows)
+            return jax.random.randint(key, (count,), self._before, self.clip_rows)
         starts, lengths = self.library.starts, self.library.lengths
         weights = jnp.asarray(self.library.weights)
         clip = jax.random.choice(jax.random.fold_in(key, 1), len(starts), (count,), p=weights)
-        first, end = jnp.asarray(starts + self.horizon - 1), jnp.asarray(starts + lengths)
+        first, end = jnp.asarray(starts + self._before), jnp.asarray(starts + lengths)
         return jax.random.randint(key, (count,), first[clip], end[clip])
 
     def history_rows(self, rows: jax.Array) -> jax.Array:
-        """Table rows ``[count, H]`` of the histories that end at ``rows``."""
-        before = rows[:, None] - np.arange(self.horizon)[::-1]
-        return jnp.where(rows[:, None] == self.clip_rows, rows[:, None], before)
+        """Table rows ``[count, H]`` of the histories that end at ``rows``; ahead of a clip stands its first row."""
+        rows = rows[:, None]
+        before = rows - self.stride * np.arange(self.horizon)[::-1]
+        if self.config.early_frames:
+            starts = self.library.starts
+            before = jnp.maximum(before, jnp.asarray(starts)[jnp.searchsorted(starts, rows, side="right") - 1])
+        return jnp.where(rows == self.clip_rows, rows, before)
 
     def _begin(self, rows: jax.Array, key: jax.Array | None) -> tuple[physics.PhysicsState, Observed]:
         """States at the table rows ``[N]`` and what is observed of them; with a key, joints are off by reset_noise."""

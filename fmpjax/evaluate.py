@@ -112,7 +112,8 @@ class Evaluator:
 
         def step(carry, _):
             sim, observed, alive, length = carry
-            action, _ = policy(observed.actor, None)
+            with self.trainer.precision():
+                action, _ = policy(observed.actor, None)
             reached, observation, fell = env.advance(sim, action)
             still_alive = alive & ~fell
             length = length + alive
@@ -136,9 +137,7 @@ class Evaluator:
 
     def play(self, state: PPOState) -> Episodes:
         """First episodes under ``state``'s mean action."""
-        library = self.trainer.library
-        clip = np.where(self.rows < len(library.qpos), library.clip_of(self.rows), 0)
-        return Episodes(*map(np.asarray, self._play(state)), clip)
+        return Episodes(*map(np.asarray, self._play(state)), self.trainer.env.clip_of(self.rows))
 
     def __call__(self, state: PPOState) -> Evaluation:
         return self.measure(self.play(state))

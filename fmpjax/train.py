@@ -3,6 +3,7 @@
 Here all parts meet: rollout, windows, prior, rewards, policy. Nothing in this file knows a method by name.
 """
 
+import contextlib
 from collections.abc import Callable, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -39,12 +40,12 @@ class Trainer:
     def __init__(self, config: Config, demonstration: MotionClip | MotionLibrary):
         priors.check(config.method)
         self.config, self.library = config, MotionLibrary.of(demonstration)
-        for clip in self.library.clips:
-            _check(clip, config)
         self.robot = robots.load(config.robot)
+        for clip in self.library.clips:
+            _check(clip, self.robot, config)
         self.env = Env(self.robot, self.library, config, physics.make(self.robot, config.physics))
         self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo)
-        windows, share = self.env.clip_windows(), self.library.window_share(self.env.horizon)
+        windows, share = self.env.clip_windows(), self.env.window_share()
         self.feature_map = features.fit_feature_map(self.robot, windows, config.features, share)
         self.expert = priors.Expert(
             windows=self.feature_map(windows),
@@ -87,6 +88,15 @@ class Trainer:
 
     def iteration(self, state: TrainState, _=None) -> tuple[TrainState, Metrics]:
         """Roll out, fit the reward and score with it, improve the policy."""
+        with self.precision():
+            return self._iteration(state)
+
+    def precision(self) -> contextlib.AbstractContextManager:
+        """The precision of the matrix products of what is traced within; the physics has its own."""
+        wanted = self.config.precision
+        return contextlib.nullcontext() if wanted == "default" else jax.default_matmul_precision(wanted)
+
+    def _iteration(self, state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, prior_key, ppo_key = jax.random.split(state.key, 4)
         env, steps = self.env.rollout(state.env, self.ppo.act(state.ppo), rollout_key, self.config.ppo.rollout_steps)
         # Devices split the windows as the prior does, by rows of the rollout: indices travel, windows do not.
@@ -143,14 +153,14 @@ class Trainer:
         return state._replace(env=state.env._replace(**split))
 
 
-def _check(clip: MotionClip, config: Config) -> None:
+def _check(clip: MotionClip, robot: robots.Robot, config: Config) -> None:
     if abs(clip.rate - config.control_rate) > 1e-6:
         raise UserError(
             f"motion {clip.name} has {clip.rate:g} samples a second: expected the control rate, "
             f"{config.control_rate:g} Hz"
         )
-    if clip.robot != config.robot:
-        raise UserError(f"motion {clip.name} is of robot {clip.robot!r}: expected {config.robot!r}")
+    if not robot.takes(clip.robot):
+        raise UserError(f"motion {clip.name} is of robot {clip.robot!r}: expected {robot.name!r}")
     if clip.duration < metrics.WINDOW:
         raise UserError(
             f"motion {clip.name} lasts {clip.duration:.2f} s: expected at least {metrics.WINDOW:g} s, the window in "

@@ -1,5 +1,7 @@
 """The presets: the paper's numbers to the letter, and every one of them trains."""
 
+import json
+
 import jax
 import numpy as np
 import pytest
@@ -13,7 +15,10 @@ from fmpjax.train import Trainer
 def test_paper_preset_is_the_paper():
     paper = configuration.flatten(configuration.preset("paper"))
     expected = {
+        "robot": "unitree_g1_29dof",
+        "precision": "float32",
         "env.count": 1024,
+        "env.early_frames": True,
         "env.episode_steps": 500,
         "env.first_cap": 500,
         "features.history": 10,
@@ -52,6 +57,15 @@ def test_paper_preset_is_the_paper():
     assert int(config.prior.query_share * config.env.count) == 768
     assert config.control_rate == pytest.approx(50) and config.physics.timestep == 0.005
     assert [round(share * 50) for share in config.evaluations] == [5, 10, 20, 30, 40, 50]
+
+
+def test_an_older_file_means_what_it_meant():
+    """Settings that came later are, in a file without them, what the program did before they came."""
+    older = json.loads(configuration.to_json(configuration.preset("paper", robot="unitree_g1")))
+    for key in ("precision", "env.demonstration_parts", "env.early_frames"):
+        del older[key]
+    read = configuration.from_json(json.dumps(older))
+    assert (read.precision, read.env.demonstration_parts, read.env.early_frames) == ("default", 1, False)
 
 
 @pytest.mark.slow

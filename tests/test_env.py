@@ -182,7 +182,7 @@ def test_reset_noise_is_fresh_at_every_fall():
     assert len(np.unique(first.round(5), axis=0)) == len(first)
 
 
-def test_fixed_reset_repeats_the_default_pose_with_soles_on_the_floor():
+def test_fixed_reset_repeats_the_default_pose_with_soles_in_the_floor():
     built = make(reset="fixed")
     state = built.reset(jax.random.PRNGKey(0))
     _, _, table = clip_table()
@@ -190,8 +190,8 @@ def test_fixed_reset_repeats_the_default_pose_with_soles_on_the_floor():
         np.testing.assert_array_equal(state.physics.qpos[i], ROBOT.default_qpos.astype(np.float32))
         assert not np.any(state.physics.qvel[i])
         np.testing.assert_allclose(state.history[i], np.repeat(table.frame[-1:], HORIZON, 0), atol=1e-6)
-        assert abs(robots.lowest_sole(ROBOT, np.asarray(state.physics.qpos[i], np.float64))) < 1e-6
-        assert abs(robots.lowest_sole(ROBOT, ROBOT.default_qpos)) < 1e-9
+        sunk = -robots.lowest_sole(ROBOT, np.asarray(state.physics.qpos[i], np.float64))
+        assert sunk == pytest.approx(robots.CONTACT_DEPTH, abs=1e-6)
 
 
 def test_resets_within_a_rollout_follow_the_regime(growing):

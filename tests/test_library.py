@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fmpjax import cli, features, motion, physics, runs
+from fmpjax import cli, features, motion, physics, rotations, runs
 from fmpjax.config import FeatureConfig, preset
 from fmpjax.env import Env
 from fmpjax.errors import UserError
 from fmpjax.evaluate import planar_speed
 from fmpjax.motion import MotionClip, MotionLibrary, library, load_library
+from fmpjax.motion.clip import refined
 from fmpjax.priors import Expert
 from fmpjax.train import Trainer
 from tests.test_train import TINY, settings
@@ -90,8 +91,8 @@ def test_frames_of_each_motion():
 
 
 def test_windows_lie_within_a_clip(two, env):
-    starts = two.window_starts(HORIZON)
-    assert starts.tolist() == [*range(21), *range(30, 221)]
+    ends = two.rows_after(HORIZON - 1)
+    assert ends.tolist() == [*range(9, 30), *range(39, 230)]
     heights = np.asarray(env.clip_windows())[..., 2]
     assert heights.shape == (212, HORIZON)
     # No window has feet on the floor and a metre above it.
@@ -99,10 +100,10 @@ def test_windows_lie_within_a_clip(two, env):
 
 
 def test_a_clip_has_its_weight_however_long_it_is(two):
-    share = two.window_share(HORIZON)
+    share = two.share_after(HORIZON - 1)
     np.testing.assert_allclose([share[:21].sum(), share[21:].sum()], SHARES)
     np.testing.assert_allclose(share[:21], 0.8 / 21)
-    assert MotionLibrary.of(two.clips[0]).window_share(HORIZON) is None
+    assert MotionLibrary.of(two.clips[0]).share_after(HORIZON - 1) is None
 
 
 def test_episodes_start_in_the_clips_by_weight(two, env):
@@ -115,6 +116,45 @@ def test_episodes_start_in_the_clips_by_weight(two, env):
     assert (two.clip_of(before) == two.clip_of(rows)[:, None]).all()
 
 
+def test_any_time_of_a_clip_begins_an_episode_and_its_first_frame_stands_before_it(robot, two):
+    """The paper's setting: four times per control step, from the first frame on; each clip's own first frame."""
+    parts = 4
+    settings = preset("smoke", **{"env.demonstration_parts": parts, "env.early_frames": True})
+    env = Env(robot, two, settings, physics.make(robot, settings.physics))
+    lengths = [(len(clip) - 1) * parts + 1 for clip in two.clips]
+    assert env.clip_rows == sum(lengths) and env.library.clips[0].rate == 200.0
+    rows = np.asarray(env.reset_rows(jax.random.PRNGKey(0), 20_000))
+    assert set(rows[rows < lengths[0]]) == set(range(lengths[0])) and rows.max() == sum(lengths) - 1
+    second = lengths[0]
+    asked = jnp.array([0, 3, 5, 40, second - 1, second, second + 2, second + 9, env.clip_rows])
+    before = np.asarray(env.history_rows(asked))
+    expected = [
+        [max(row - parts * k, second if row >= second else 0) for k in reversed(range(HORIZON))] for row in asked[:-1]
+    ]
+    np.testing.assert_array_equal(before, [*expected, [env.clip_rows] * HORIZON])
+    # The prior's windows are those histories, of every row.
+    windows = np.asarray(env.clip_windows())
+    assert len(windows) == env.clip_rows and env.window_share().shape == (env.clip_rows,)
+    table = np.asarray(env._table.frame)
+    np.testing.assert_array_equal(windows[second + 9], table[before[-2]])
+    np.testing.assert_allclose([env.window_share()[:second].sum(), env.window_share()[second:].sum()], SHARES)
+    np.testing.assert_array_equal(env.clip_of(np.array([0, second - 1, second, env.clip_rows])), [0, 0, 1, 0])
+
+
+def test_refined_clip_holds_the_clips_samples_and_what_lies_between(walk):
+    fine = refined(walk, 4)
+    assert len(fine) == 4 * (len(walk) - 1) + 1 and fine.rate == 200.0
+    np.testing.assert_array_equal(fine.qpos[::4], walk.qpos)
+    np.testing.assert_allclose(fine.qvel[::4], walk.qvel, atol=1e-12)
+    np.testing.assert_allclose(fine.qpos[1::4, 7:], 0.75 * walk.qpos[:-1, 7:] + 0.25 * walk.qpos[1:, 7:], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(fine.qpos[:, 3:7], axis=1), 1.0, atol=1e-12)
+    # Half way the root has turned by half.
+    whole = rotations.log_map(rotations.multiply(rotations.conjugate(walk.qpos[5, 3:7]), walk.qpos[6, 3:7]))
+    half = rotations.log_map(rotations.multiply(rotations.conjugate(walk.qpos[5, 3:7]), fine.qpos[22, 3:7]))
+    np.testing.assert_allclose(half, whole / 2, atol=1e-12)
+    assert refined(walk, 1) is walk
+
+
 def test_one_clip_draws_as_it_always_did(robot, walk):
     one = Env(robot, walk, preset("smoke"), physics.make(robot, preset("smoke").physics))
     key = jax.random.PRNGKey(3)
@@ -124,7 +164,7 @@ def test_one_clip_draws_as_it_always_did(robot, walk):
 
 def test_the_expert_bank_and_single_draws_follow_the_weights(two):
     windows = jnp.arange(212.0)[:, None]
-    expert = Expert(windows, 1.0, jnp.ones(1), 1, share=jnp.asarray(two.window_share(HORIZON)))
+    expert = Expert(windows, 1.0, jnp.ones(1), 1, share=jnp.asarray(two.share_after(HORIZON - 1)))
     for seed in range(10):
         rows = np.asarray(expert.bank_rows(jax.random.PRNGKey(seed), 500))
         counts = np.bincount(rows, minlength=212)
@@ -139,7 +179,7 @@ def test_the_expert_bank_and_single_draws_follow_the_weights(two):
 def test_features_are_standardised_by_weight(robot, two, env):
     """A weight of eight to two is as good as repeating windows until they are eight to two."""
     windows = env.clip_windows()
-    weighed = features.fit_feature_map(robot, windows, FeatureConfig(), two.window_share(HORIZON))
+    weighed = features.fit_feature_map(robot, windows, FeatureConfig(), two.share_after(HORIZON - 1))
     # 21 windows of share 0.8 / 21 and 191 of 0.2 / 191: repeated 764 and 21 times.
     repeated = jnp.concatenate([jnp.repeat(windows[:21], 764, axis=0), jnp.repeat(windows[21:], 21, axis=0)])
     plain = features.fit_feature_map(robot, repeated, FeatureConfig())

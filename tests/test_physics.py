@@ -273,3 +273,39 @@ def test_warp_that_is_not_installed_is_refused(robot, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco.mjx.third_party.mujoco_warp._src.types", None)
     with pytest.raises(UserError, match=r"'warp': this installation lacks it .*: install fmpjax\[warp\]"):
         physics.make(robot, dataclasses.replace(PAPER, backend="mjx", impl="warp"))
+
+
+# --- a robot that touches itself -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def entangled():
+    """Six states of the paper's robot, hands at its hips, in the air and on the floor, and targets near them."""
+    robot = robots.load("unitree_g1_29dof")
+    rng = np.random.default_rng(1)
+    qpos = np.stack([robot.default_qpos] * 6)
+    qpos[:3, 2], qpos[3:, 2] = 3.0, 0.79
+    qpos[:, 7:] += 0.05 * rng.normal(size=(6, robot.joint_count))
+    targets = qpos[:, 7:] + 0.1 * rng.normal(size=(6, robot.joint_count))
+    qvel = 0.2 * rng.normal(size=(6, qpos.shape[1] - 1))
+    return robot, (qpos.astype(np.float32), qvel.astype(np.float32), targets.astype(np.float32))
+
+
+def test_hands_are_pushed_out_of_the_hips(entangled):
+    robot, (qpos, qvel, _) = entangled
+    shoulder = 7 + robot.joint_names.index("left_shoulder_roll_joint")
+    course = advance(physics.make(robot, PAPER), qpos[:3], 0 * qvel[:3], qpos[:3, 7:], 5)
+    assert (course.qpos[-1, :, shoulder] > qpos[:3, shoulder] + 0.05).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("impl", ["jax", "warp"])
+def test_mjx_collides_as_native_does(entangled, impl):
+    if impl == "warp":
+        pytest.importorskip("warp", reason="fmpjax[warp] is not installed")
+    robot, states = entangled
+    ours = advance(physics.make(robot, PAPER), *states, 2)
+    theirs = advance(physics.make(robot, dataclasses.replace(PAPER, backend="mjx", impl=impl)), *states, 2)
+    position, velocity = (np.abs(a - b).max(axis=(1, 2)) for a, b in zip(ours[:2], theirs[:2], strict=True))
+    print(f"native and {impl}, touching itself: qpos {position}, qvel {velocity}")
+    assert position.max() < 2e-4 and velocity.max() < 2e-2

@@ -1,8 +1,10 @@
-"""The shipped G1 against the maker's, and forward kinematics and floor tests against MuJoCo's own.
+"""The shipped G1 models against the maker's, and forward kinematics and floor tests against MuJoCo's own.
 
-``data/g1_figures.json`` is what `figures` gives for the maker's ``g1_29dof_rev_1_0`` model at three configurations.
+``data/g1_figures.json`` is what `figures` gives for the maker's ``g1_29dof_rev_1_0`` model at three configurations,
+``data/g1_29dof_figures.json`` the same for the first generation, ``g1_29dof``.
 """
 
+import copy
 import json
 import re
 from typing import NamedTuple
@@ -13,7 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from fmpjax import kinematics, robots
+from fmpjax import kinematics, motion, robots
 from fmpjax.errors import UserError
 
 # Rotor inertia about the joint, kg m^2, by motor (maker's tables); ankles, waist roll and waist pitch have two each.
@@ -75,6 +77,16 @@ def recorded(data):
     return json.loads((data / "g1_figures.json").read_text())
 
 
+@pytest.fixture(scope="module")
+def first_generation():
+    return robots.load("unitree_g1_29dof")
+
+
+@pytest.fixture(scope="module")
+def first_recorded(data):
+    return json.loads((data / "g1_29dof_figures.json").read_text())
+
+
 def random_states(robot, count, *, height=(0.3, 1.2), tilt=np.inf, seed=0):
     """``[count, 7 + J]``: joints within limits, heights in m, any attitude or rotations by about ``tilt`` rad."""
     rng = np.random.default_rng(seed)
@@ -110,11 +122,83 @@ def test_model_has_the_recorded_masses_inertias_joints_and_poses(robot, recorded
     assert_same(figures(robot.model, [p["qpos"] for p in recorded["poses"]]), recorded)
 
 
-def test_makers_model_has_the_recorded_figures(external, recorded):
-    text = external("g1_29dof_rev_1_0.xml").read_text()
+def test_first_generation_has_the_recorded_figures_but_for_the_wrists_torque(first_generation, first_recorded):
+    assert first_generation.total_mass == pytest.approx(35.1121, abs=1e-4)
+    expected = copy.deepcopy(first_recorded)
+    for name, joint in expected["joints"].items():
+        if re.search("wrist_(pitch|yaw)", name):
+            assert joint["effort"] == [-5, 5]  # the maker's; MimicKit's, and so the paper's, is 25
+            joint["effort"] = [-25, 25]
+    assert_same(figures(first_generation.model, [p["qpos"] for p in expected["poses"]]), expected)
+
+
+@pytest.mark.parametrize(
+    "file, recording", [("g1_29dof_rev_1_0.xml", "g1_figures.json"), ("g1_29dof.xml", "g1_29dof_figures.json")]
+)
+def test_makers_model_has_the_recorded_figures(external, data, file, recording):
+    text = external(file).read_text()
     lines = [line for line in text.splitlines() if "mesh" not in line or "<compiler" in line]
     maker = mujoco.MjModel.from_xml_string("\n".join(lines))
+    recorded = json.loads((data / recording).read_text())
     assert_same(figures(maker, [p["qpos"] for p in recorded["poses"]]), recorded)
+
+
+def test_generations_differ_in_the_waist_alone(robot, first_generation):
+    """Joints, gains and legs are one robot's, so that either takes the other's motions as they are."""
+    assert first_generation.joint_names == robot.joint_names
+    for field in ("joint_axis", "joint_low", "joint_high", "stiffness", "damping", "key_offset"):
+        np.testing.assert_array_equal(getattr(first_generation, field), getattr(robot, field), err_msg=field)
+    names = [robot.joint_names[i] for i in np.flatnonzero(first_generation.effort != robot.effort)]
+    assert names and all(re.search("hip_roll|wrist_(pitch|yaw)", name) for name in names)
+    moved = np.abs(first_generation.body_position - robot.body_position).max(1)
+    assert {robot.model.body(b + 1).name for b in np.flatnonzero(moved)} == {
+        "waist_roll_link", "torso_link", "left_shoulder_pitch_link", "right_shoulder_pitch_link",
+    }  # fmt: skip
+    assert first_generation.takes("unitree_g1") and not robot.takes("unitree_g1_29dof")
+    walk = motion.load("walk", robot="unitree_g1_29dof")
+    assert walk.robot == "unitree_g1_29dof"
+    np.testing.assert_array_equal(walk.qpos, motion.load("walk").qpos)
+
+
+def test_first_generation_collides_with_itself_and_the_floor(robot, first_generation):
+    assert first_generation.self_collision and not robot.self_collision
+    model = first_generation.physics_model()
+    data = mujoco.MjData(model)
+    data.qpos[:] = first_generation.default_qpos
+    # The left arm straight down and pressed inward: the hand is in the thigh's way.
+    data.qpos[7 + first_generation.joint_names.index("left_shoulder_roll_joint")] = -0.2
+    mujoco.mj_forward(model, data)
+    pairs = {frozenset(model.geom(g).name for g in c.geom) for c in data.contact}
+    assert frozenset({"left_hip_fall", "left_hand_fall"}) in pairs
+    assert not any("left_hip_fall" in pair and "left_thigh_fall" in pair for pair in pairs)  # parent and child
+    # The maker's ranges reach no further than before.
+    others = robot.physics_model()
+    data = mujoco.MjData(others)
+    data.qpos[:] = robot.default_qpos
+    data.qpos[7 + robot.joint_names.index("left_shoulder_roll_joint")] = -0.5
+    mujoco.mj_forward(others, data)
+    assert all("floor" in {others.geom(g).name for g in c.geom} for c in data.contact)
+
+
+def test_capsule_feet_have_a_point_at_either_end(first_generation):
+    """Soles of the first generation are three capsules a foot: lowest points are MuJoCo's distances to the floor."""
+    robot = first_generation
+    assert len(robot.sole_body) == 12 and (robot.sole_radius == 0.02).all()
+    floor = robot.model.geom("floor").id
+    soles = [i for i in range(robot.model.ngeom) if "_foot_" in robot.model.geom(i).name]
+    states = random_states(robot, 20, tilt=0.5, seed=6)
+    for qpos, data in zip(states, mujoco_states(robot, states), strict=True):
+        expected = min(mujoco.mj_geomDistance(robot.model, data, floor, g, 10.0, None) for g in soles)
+        assert robots.lowest_sole(robot, qpos) == pytest.approx(expected, abs=1e-9)
+
+
+def test_first_generation_starts_in_mimickits_pose(first_generation):
+    robot = first_generation
+    angles = dict(zip(robot.joint_names, robot.default_qpos[7:], strict=True))
+    assert {name for name, angle in angles.items() if angle} == {"left_elbow_joint", "right_elbow_joint"}
+    assert angles["left_elbow_joint"] == 1.57
+    np.testing.assert_array_equal(robot.default_qpos[:7], [0, 0, 0.8, 1, 0, 0, 0])
+    assert robots.lowest_sole(robot, robot.default_qpos) == pytest.approx(0.8 - 0.7919, abs=1e-4)
 
 
 def test_robot_repeats_the_model(robot, recorded):
@@ -193,14 +277,31 @@ def test_only_the_feet_and_shins_touch_the_floor(robot):
 def test_default_pose_stands_on_its_soles(robot, solved):
     qpos = robot.default_qpos
     assert ((robot.joint_low < qpos[7:]) & (qpos[7:] < robot.joint_high)).all()
-    # All eight sole spheres rest on the floor: hip, knee and ankle pitch add up to zero.
-    np.testing.assert_allclose(solved.sole_heights[-1], np.zeros(8), atol=1e-6)
+    # All eight sole spheres are as far in the floor: hip, knee and ankle pitch add up to zero.
+    np.testing.assert_allclose(solved.sole_heights[-1], np.full(8, -robots.CONTACT_DEPTH), atol=1e-6)
     assert not solved.fallen[-1]
     assert 0.7 < qpos[2] < 0.8 and qpos[3:7].tolist() == [1, 0, 0, 0]
 
 
+def test_default_pose_is_clear_of_the_contact_boundary(robot):
+    """Rounding of the state decides nothing: every sole bears, whatever joint noise of 1e-6 rad does."""
+    model = robot.physics_model()
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    for _ in range(20):
+        qpos = robot.default_qpos.astype(np.float32).astype(np.float64)
+        qpos[7:] += 1e-6 * rng.normal(size=robot.joint_count)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, 0.0, qpos[7:]
+        mujoco.mj_forward(model, data)
+        assert data.ncon == 8
+        force, total = np.zeros(6), 0.0
+        for i in range(data.ncon):
+            mujoco.mj_contactForce(model, data, i, force)
+            total += force[0]
+        assert 0.7 < total / (9.81 * robot.total_mass) < 1.1
+
+
 def test_unknown_robot():
-    with pytest.raises(UserError, match="unknown robot 'atlas': expected one of strider, unitree_g1"):
+    with pytest.raises(UserError, match="unknown robot 'atlas': expected one of strider, unitree_g1, unitree_g1_29dof"):
         robots.load("atlas")
 
 

@@ -39,6 +39,27 @@ class MotionClip:
         return cls(name, robot, float(rate), qpos, velocities(qpos, rate))
 
 
+def refined(clip: MotionClip, parts: int) -> MotionClip:
+    """The clip with every interval between two samples cut into ``parts``: ``(T - 1) parts + 1`` samples.
+
+    Every ``parts``-th sample is the clip's own. Between them positions, joints and velocities change linearly, the
+    root's orientation along the shorter arc.
+    """
+    if parts == 1:
+        return clip
+    at = np.arange((len(clip) - 1) * parts + 1)
+    left = np.minimum(at // parts, len(clip) - 2)
+    fraction = ((at - left * parts) / parts)[:, None]
+
+    def between(samples: np.ndarray) -> np.ndarray:
+        return samples[left] + fraction * (samples[left + 1] - samples[left])
+
+    qpos = between(clip.qpos)
+    qpos[:, 3:7] = rotations.slerp(clip.qpos[left, 3:7], clip.qpos[left + 1, 3:7], fraction)
+    qpos[::parts] = clip.qpos
+    return dataclasses.replace(clip, rate=clip.rate * parts, qpos=qpos, qvel=between(clip.qvel))
+
+
 def continuous(q_wxyz: np.ndarray) -> np.ndarray:
     """Unit quaternions ``[T, 4]`` with signs that never flip between samples; the first has ``w >= 0``."""
     q = q_wxyz / np.linalg.norm(q_wxyz, axis=-1, keepdims=True)

@@ -48,18 +48,18 @@ class MotionLibrary:
         """First row of each clip, ``[K]``."""
         return np.cumsum(self.lengths) - self.lengths
 
-    def window_starts(self, horizon: int) -> np.ndarray:
-        """First rows of the windows of ``horizon`` rows that lie within a clip, ``[W]``."""
+    def rows_after(self, before: int) -> np.ndarray:
+        """Rows with at least ``before`` rows of their own clip ahead of them, ``[W]``."""
         return np.concatenate(
-            [start + np.arange(n - horizon + 1) for start, n in zip(self.starts, self.lengths, strict=True)]
+            [np.arange(start + before, start + n) for start, n in zip(self.starts, self.lengths, strict=True)]
         )
 
-    def window_share(self, horizon: int) -> np.ndarray | None:
-        """How often each of those windows is drawn, ``[W]``, summing to one; None for one clip, where all are alike."""
+    def share_after(self, before: int) -> np.ndarray | None:
+        """How often each of those rows is drawn, ``[W]``, summing to one; None for one clip, where all are alike."""
         if len(self.clips) == 1:
             return None
-        windows = self.lengths - horizon + 1
-        return np.repeat(np.array(self.weights) / windows, windows)
+        rows = self.lengths - before
+        return np.repeat(np.array(self.weights) / rows, rows)
 
     def clip_of(self, rows: np.ndarray) -> np.ndarray:
         """Index of the clip of each row; that of the last clip for rows past the end."""

@@ -21,7 +21,11 @@ class MjxPhysics:
 
     def __init__(self, robot: Robot, config: PhysicsConfig):
         self.config = config
-        self.model = model(robot, config)
+        limits = {}
+        if robot.self_collision and config.impl == "jax":
+            # MJX in JAX works on every pair of geoms at every step: of a pair of shapes' kinds the nearest are kept.
+            limits = {"max_geom_pairs": config.max_contacts, "max_contact_points": config.max_contacts}
+        self.model = model(robot, config, **limits)
         self._device = jax.local_devices()[0]  # of several processes each has its own
         self._overflow = 0  # bits of Warp's word on worlds that lost contacts or constraints to a full buffer
         if config.impl == "warp":

@@ -73,9 +73,10 @@ class NativePhysics:
         return reached.reshape(*batch, -1)
 
 
-def model(robot: Robot, config: PhysicsConfig) -> mujoco.MjModel:
-    """The robot's model with the run's solver options."""
+def model(robot: Robot, config: PhysicsConfig, **numerics: float) -> mujoco.MjModel:
+    """The robot's model with the run's solver options, and custom numbers that a backend reads."""
     built = robot.physics_model(
+        numerics=numerics,
         timestep=config.timestep,
         iterations=config.iterations,
         ls_iterations=config.ls_iterations,

@@ -14,7 +14,7 @@ MARKS = ("qpos", "rate", "robot")
 def read(file: Path, content: Arrays, robot: Robot) -> Recording:
     """The recording in a file written by `fmpjax.motion.save`."""
     stored = "".join(content["robot"].ravel()[:1].astype(str))
-    if stored != robot.name:
+    if not robot.takes(stored):
         raise UserError(f"{file}: the motion is for robot {stored[:60]!r}, expected {robot.name!r}")
     what = f"root xyz, quaternion wxyz, {robot.joint_count} joints of robot {robot.name!r}"
     qpos = table(file, "qpos", content["qpos"], 7 + robot.joint_count, what=what)
