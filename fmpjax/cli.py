@@ -1,4 +1,4 @@
-"""The command line: ``fmpjax train``, ``evaluate``, ``render``, ``export``, ``report``, ``motion``, ``config``."""
+"""The command line: ``fmpjax train``, ``evaluate``, ``diagnose``, ``render``, ``export``, ``report``, ``motion`` ..."""
 
 import dataclasses
 import math
@@ -255,6 +255,21 @@ class Export:
 
 
 @dataclasses.dataclass(frozen=True)
+class Diagnose:
+    """Say what is wrong with a run, finished or not, in words."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run, or of its exported results."""
+    last: bool = False
+    """Look at the newest evaluation in place of the best policy's."""
+
+    def __call__(self) -> None:
+        from fmpjax import diagnose
+
+        print(diagnose.text(diagnose.read(self.run, last=self.last)))
+
+
+@dataclasses.dataclass(frozen=True)
 class Report:
     """Gather what the experiments found on one page, ours beside the paper's."""
 
@@ -308,7 +323,7 @@ def _default_preset() -> str:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: bad input is one sentence and exit code 2."""
     commands = {"train": Train, "evaluate": Evaluate, "render": Render, "export": Export}
-    commands |= {"report": Report, "motion": Motion, "config": ShowConfig}
+    commands |= {"diagnose": Diagnose, "report": Report, "motion": Motion, "config": ShowConfig}
     command = tyro.extras.subcommand_cli_from_dict(
         commands, prog="fmpjax", description="Flow-Matched Motion Priors in JAX.", args=arguments
     )

@@ -150,12 +150,14 @@ class Plot(Source):
 
 @dataclasses.dataclass(frozen=True)
 class Synthesize:
-    """Write a steady walk of our own."""
+    """Write a steady walk of our own; --speed 0 alone is standing."""
 
     out: Path
     """File to write, .npz."""
     speed: float | None = None
-    """Along the path, m/s; the robot's own by default."""
+    """Ahead, m/s, negative backward; the robot's own by default."""
+    sideways: float = 0.0
+    """To the left, m/s."""
     turn: float = 0.0
     """To the left, rad/s."""
     duration: float = 8.0
@@ -169,9 +171,10 @@ class Synthesize:
 
     def __call__(self) -> None:
         robot = robots.load(self.robot)
-        clip = gait.synthesize(
-            robot, speed=self.speed, turn=self.turn, duration=self.duration, rate=self.rate, style=self.style
-        )
+        speed = robot.gait.get("speed", 0.0) if self.speed is None else self.speed
+        walk = gait.make(robot, gait.Command(speed, self.sideways, self.turn), rate=self.rate, style=self.style)
+        clip = walk.clip(self.duration)
+        print(walk.said())
         print(f"wrote {motion.save(clip, self.out)}: {clip.duration:.2f} s")
 
 

@@ -8,6 +8,7 @@ import dataclasses
 import difflib
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from fmpjax.errors import UserError
@@ -342,6 +343,18 @@ _BEFORE: dict[str, Any] = {"precision": "default", "env.demonstration_parts": 1,
 def from_json(text: str) -> Config:
     """The configuration that `to_json` wrote."""
     return validate(with_changes(Config(), {**_BEFORE, **json.loads(text)}))
+
+
+def read(path: Path) -> Config:
+    """The configuration in a run's ``config.json``.
+
+    Raises:
+      UserError: the file holds none.
+    """
+    try:
+        return from_json(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError):
+        raise UserError(f"{path} is not valid JSON: expected a run's configuration") from None
 
 
 _CHOICES = {

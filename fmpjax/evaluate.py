@@ -18,7 +18,6 @@ from fmpjax.train import Trainer
 
 DETAILED = 64  # episodes whose joints and feet are analysed [P]
 WINDOWS = 512  # windows at most on either side of the Sinkhorn discrepancy [D]
-TURNS = 0.1  # rad/s, from which a demonstration turns [D]
 CONTACT_HEIGHT = 0.01  # m, a foot is in contact where a sole point is lower [D]
 
 
@@ -76,7 +75,7 @@ class Evaluation:
 
         Too fast is no better than too slow. Where the demonstration turns, speeds are along the own heading.
         """
-        late = self.path_speed if self.demonstration_turning > TURNS else self.late_speed
+        late = self.path_speed if self.demonstration_turning > metrics.TURNS else self.late_speed
         error = 1.0 if np.isnan(late) else abs(late - self.demonstration_speed) / max(self.demonstration_speed, 0.1)
         return (1.0 - self.falls / self.episodes) * max(0.0, 1.0 - error)
 
@@ -187,7 +186,9 @@ class Evaluator:
             demonstration_turning=float(library.mean(abs(own_turn))),
             joint_ranges=tuple(np.degrees(_finite_mean(ranges)).round(2).tolist()),
             expert_ranges=tuple(np.degrees(expert).round(2).tolist()),
-            motions=self._shares(played, np.where(abs(own_turn[played.clip]) > TURNS, path_speed, speed), own_speed),
+            motions=self._shares(
+                played, np.where(abs(own_turn[played.clip]) > metrics.TURNS, path_speed, speed), own_speed
+            ),
         )
 
     def _shares(self, played: Episodes, speed: np.ndarray, own_speed: list[float]) -> tuple[Share, ...]:

@@ -17,6 +17,7 @@ LATE_START, LATE_END = 5.0, 10.0  # s, both included
 WINDOW = 1.0  # s, of a joint range
 PERCENTILES = 5.0, 95.0
 STILL = 1e-6  # rad; a joint whose expert range is smaller has no ratio to it
+TURNS = 0.1  # rad/s, from which a demonstration turns [D]
 
 
 @dataclasses.dataclass(frozen=True)

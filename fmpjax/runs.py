@@ -23,7 +23,7 @@ import jax
 import numpy as np
 
 from fmpjax import config as configuration
-from fmpjax import motion, policy, sharding
+from fmpjax import diagnose, motion, policy, sharding
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import Config
 from fmpjax.errors import UserError, out_of_memory
@@ -95,11 +95,7 @@ class Run:
 
     @property
     def config(self) -> Config:
-        path = self.folder / "config.json"
-        try:
-            return configuration.from_json(path.read_text())
-        except (json.JSONDecodeError, UnicodeDecodeError, AttributeError):
-            raise UserError(f"{path} is not valid JSON: expected a run's configuration") from None
+        return configuration.read(self.folder / "config.json")
 
     def extend(self, transitions: int) -> None:
         """Give the run a larger budget; its evaluations are at shares of that from here on."""
@@ -272,6 +268,9 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
                     better = evaluation.quality >= best[i]
                 # Rows ahead of their checkpoint are computed again after a kill; rows behind it would be missing.
                 log.write(done, transitions, training_seconds, row)
+                if evaluating:
+                    figures = json.loads(evaluation.to_json())
+                    progress.note(diagnose.text(diagnose.Course(log.rows, config, figures)))
                 if better:
                     best[i] = evaluation.quality
                     _save(run, whole[i], best=True)
@@ -390,6 +389,8 @@ def finish(run: Run) -> list[Path]:
     render.contact_sheet(run.folder / "frames.png", frames, columns=6)
     paths = [run.folder / "evaluation.json", run.folder / "frames.png"]
     if (run.folder / "metrics.csv").exists():
+        if MetricsLog.read(run.folder / "metrics.csv"):
+            print(diagnose.text(diagnose.read(run.folder)))
         curves.learning_curves(run.folder / "metrics.csv", run.folder / "curves.png")
         paths.append(run.folder / "curves.png")
     return [*paths, video(run, trainer, played)]

@@ -154,7 +154,7 @@ def test_good_file_makes_a_run(tmp_path, rows):
 # --- run folders -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", [("evaluate",), ("render",), ("train", "--resume", "--run")])
+@pytest.mark.parametrize("command", [("evaluate",), ("render",), ("diagnose",), ("train", "--resume", "--run")])
 def test_missing_run(refused, command):
     assert "nowhere is not a run folder: expected config.json in it" in refused(*command, "nowhere")
 

@@ -201,8 +201,9 @@ def test_a_spent_budget_trains_no_further(trained):
 
 
 @pytest.mark.slow
-def test_finish_writes_evaluation_curves_and_video(trained):
+def test_finish_writes_evaluation_curves_and_video(trained, capsys):
     paths = runs.finish(runs.Run.open(trained))
+    assert ", by evaluation.json (the best policy) and the last " in capsys.readouterr().out
     assert all(p.is_file() and p.stat().st_size > 0 for p in paths)
     assert {"evaluation.json", "curves.png"} <= {p.name for p in paths}
     evaluation = json.loads((trained / "evaluation.json").read_text())
@@ -257,7 +258,7 @@ def test_a_resume_in_a_new_process_is_exact(trained, stopped):
 
 
 @pytest.mark.slow
-def test_a_larger_budget_goes_on_as_if_it_had_been_the_first(trained, tmp_path, monkeypatch):
+def test_a_larger_budget_goes_on_as_if_it_had_been_the_first(trained, tmp_path, monkeypatch, capsys):
     """A signal in its last iterations costs the first budget nothing, not even the evaluation at its end."""
     run = runs.Run.create(tmp_path / "run", tiny(transitions=TINY["transitions"] // 5))
     with monkeypatch.context() as patch:
@@ -268,6 +269,9 @@ def test_a_larger_budget_goes_on_as_if_it_had_been_the_first(trained, tmp_path, 
     run.extend(TINY["transitions"])
     assert run.config == tiny()
     assert runs.train(run, resume=True) is runs.End.BUDGET
+    evaluated = [int(row["transitions"]) for row in rows(run.folder) if row["eval/quality"]]
+    said = re.findall(r"^diagnosis at ([0-9,]+) transitions, by the newest evaluation", capsys.readouterr().out, re.M)
+    assert [int(number.replace(",", "")) for number in said] == evaluated
     whole, halves = leaves(trained), leaves(run.folder)
     for name, leaf in whole.items():
         np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
