@@ -27,7 +27,7 @@ __all__ = ["LIBRARY", "Command", "Gait", "Style", "make", "measure", "synthesize
 BENT = 0.19  # rad, least angle of a knee at the robot's own speed; a straight knee makes the joints race
 MARGIN = 0.04  # rad, least distance of a leg's joint to its limit
 LOWEST = 0.88  # of the height of the pelvis in the robot's own walk
-GAP = 0.03  # m, between the soles where one passes the other
+GAP = 0.04  # m, between the soles where one passes the other
 TRIAL = 48  # samples of a stride that is tried
 TRIES = (0.0, 0.5, 1.0)  # cadences between the fitting one and the fastest
 SCALES = 6  # halvings, to tell how much of a command is within reach
@@ -112,8 +112,8 @@ class Gait:
     def said(self) -> str:
         """The chosen numbers in words."""
         if not self.chosen:
-            return "the robot's own style, but for what is given"
-        return "chosen: " + ", ".join(f"{name} {getattr(self.style, name):.4g}" for name in self.chosen)
+            return "the robot's own style but for the given numbers"
+        return "chosen: " + ", ".join(f"{name} {getattr(self.style, name) + 0.0:.4g}" for name in self.chosen)
 
 
 def synthesize(
@@ -245,20 +245,21 @@ def _find(robot: Robot, command: Command, rate: float, style: Style, tries: tupl
     legs = [Leg(robot, foot) for foot in robot.feet]
     slowest = fit.cadence
     for part in tries if "cadence" not in given and slowest < FASTEST else (0.0,):
-        samples = 2 * max(1, round(rate / (slowest + part * (FASTEST - slowest))))
+        cadence = slowest + part * (FASTEST - slowest)
+        samples = 2 * max(1, round(rate / cadence))
         period = samples / rate
         wide = 2 * legs[0].half_width + GAP + (abs(command.sideways) + legs[0].toe[0] * abs(command.turn)) * period / 2
-        free = {"cadence": 2 / period, "half_width": max(fit.half_width, wide / 2)}
+        free = {"cadence": cadence, "half_width": max(fit.half_width, wide / 2)}
         free = {name: value for name, value in free.items() if name not in given}
         pelvis = -fit.toe_off / 2 * period * np.array([command.speed, command.sideways])
         found = _Found(dataclasses.replace(fit, **free), samples, period, pelvis)
-        found = _raised(robot, command, found, "pelvis_height" in given)
+        found = _highest(robot, command, found, "pelvis_height" in given)
         if found is not None:
             return found
     return None
 
 
-def _raised(robot: Robot, command: Command, found: _Found, fixed: bool) -> _Found | None:
+def _highest(robot: Robot, command: Command, found: _Found, fixed: bool) -> _Found | None:
     """The same with the highest pelvis, to the millimetre, at which the knees are bent enough; None where none is."""
     joints = np.concatenate([Leg(robot, foot).joints for foot in robot.feet])
     bent = 0.0 if fixed else BENT * max(1.0, effort(robot, command)) ** 2

@@ -37,10 +37,8 @@ class Leg:
         own = robot.sole_body == foot
         points = robot.sole_point[own]
         self.radius = float(robot.sole_radius[own][0])
-        self.heel, self.toe = (
-            np.abs(points[i(points[:, 0])] * [0, 1, 0]) + points[i(points[:, 0])] * [1, 0, 1]
-            for i in (np.argmin, np.argmax)
-        )
+        ends = points[[np.argmin(points[:, 0]), np.argmax(points[:, 0])]]
+        self.heel, self.toe = np.stack([ends[:, 0], np.abs(ends[:, 1]), ends[:, 2]], axis=-1)
         self.half_width = float(np.abs(points[:, 1]).max()) + self.radius
         self.angles = robot.default_qpos[7 + self.joints]
         self._jacobian = np.zeros((6, robot.model.nv))

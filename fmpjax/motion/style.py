@@ -94,12 +94,13 @@ def fitted(robot: Robot, command: Command, style: Style = OPEN) -> Style:
     roll = 2 * ahead / (1 + abs(ahead)) * (1.0 if ahead > 0 else BACKWARD)
     swing = float(np.clip(ahead, -BACKWARD, 1.5))
     small = min(1.0, 2 * hard)
-    later = SLOW_LATER * max(0.0, 1 - hard)
+    pace = hard or 1.0  # steps on the spot, where a lift is given, are the robot's own
+    later = SLOW_LATER * max(0.0, 1 - pace)
     middle, half = (own.pressure_start + own.pressure_end) / 2, (own.pressure_end - own.pressure_start) / 2
     half = half * float(np.clip(2 * ahead, -1, 1))
     found = dataclasses.replace(
         own,
-        cadence=min(FASTEST, own.cadence * (1 + hard) / 2),
+        cadence=min(FASTEST, own.cadence * (1 + pace) / 2),
         landing_pitch=own.landing_pitch * roll,
         lowest_pitch=own.lowest_pitch * roll,
         highest_pitch=own.highest_pitch * min(roll, 1.0),
