@@ -14,7 +14,8 @@ import pytest
 
 from fmpjax import motion, robots, rotations
 from fmpjax.errors import UserError
-from fmpjax.motion.readers import beyondmimic, pickled
+from fmpjax.motion.readers import bodies as bodies_reader
+from fmpjax.motion.readers import pickled
 
 ROBOT = robots.load("unitree_g1")
 JOINTS = ROBOT.joint_count
@@ -70,7 +71,7 @@ def deep(qpos):
 
 def wide(qpos):
     content = deep(qpos)
-    order, joints = beyondmimic.breadth_first(ROBOT)
+    order, joints = bodies_reader.breadth_first(ROBOT)
     places = {key: content[key][:, order] for key in ("body_pos_w", "body_quat_w")}
     return content | places | {"joint_pos": qpos[:, 7 + joints]}
 
@@ -136,7 +137,7 @@ def test_lists_and_fortran_order(tmp_path, qpos):
 
 
 def test_breadth_first_order():
-    assert " ".join(map(str, beyondmimic.breadth_first(ROBOT)[1])) == ISAAC
+    assert " ".join(map(str, bodies_reader.breadth_first(ROBOT)[1])) == ISAAC
 
 
 def test_bodies_of_another_robot(tmp_path, qpos):

@@ -1,5 +1,7 @@
 """Clips made from a clip: its mirror image, turned to a heading, closed to a loop, put right."""
 
+import dataclasses
+
 import numpy as np
 
 from fmpjax import rotations
@@ -78,6 +80,22 @@ def looped(clip: MotionClip) -> MotionClip:
     return _with(clip, qpos)
 
 
+def repeated(clip: MotionClip, times: int) -> MotionClip:
+    """The clip ``times`` times on end, each copy where the one before has ended, after its ends are made to meet."""
+    closed, turn = looped(clip).qpos, np.array([1.0, 0.0, 0.0, 0.0])
+    pieces, place = [closed[:1]], closed[0, :3]
+    step = closed[1:] - np.concatenate([closed[0, :3], np.zeros(clip.qpos.shape[1] - 3)])
+    turned = rotations.yaw(closed[-1, 3:7]) - rotations.yaw(closed[0, 3:7])
+    about = rotations.exp_map(np.array([0.0, 0.0, turned]))
+    for _ in range(times):
+        piece = step.copy()
+        piece[:, :3] = place + rotations.rotate(turn, step[:, :3])
+        piece[:, 3:7] = rotations.multiply(turn, step[:, 3:7])
+        pieces.append(piece)
+        place, turn = piece[-1, :3], rotations.multiply(turn, about)
+    return _with(clip, np.concatenate(pieces))
+
+
 def fixed(robot: Robot, clip: MotionClip) -> tuple[MotionClip, list[str]]:
     """The clip within the joints' limits and with its soles on the floor, and sentences that say what was changed."""
     said, qpos = [], clip.qpos.copy()
@@ -95,4 +113,5 @@ def fixed(robot: Robot, clip: MotionClip) -> tuple[MotionClip, list[str]]:
 
 
 def _with(clip: MotionClip, qpos: np.ndarray) -> MotionClip:
-    return MotionClip.from_qpos(clip.name, clip.robot, clip.rate, qpos)
+    made = MotionClip.from_qpos(clip.name, clip.robot, clip.rate, qpos)
+    return dataclasses.replace(made, reading=clip.reading)
