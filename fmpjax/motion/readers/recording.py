@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fmpjax import rotations
 from fmpjax.errors import UserError
 from fmpjax.motion.clip import Fact, Reading
 from fmpjax.robots import Robot
@@ -246,11 +247,6 @@ def plain_name(name: str) -> str:
     return "_".join(word for word in words if word not in ("joint", "dof", "pos", "angle", "link", "rad"))
 
 
-def up(q_wxyz: np.ndarray) -> np.ndarray:
-    """Cosine of the tilt of quaternions ``[T, 4]``: 1 upright, -1 upside down."""
-    return 1 - 2 * (q_wxyz[:, 1] ** 2 + q_wxyz[:, 2] ** 2) / np.maximum(np.sum(q_wxyz**2, axis=1), 1e-12)
-
-
 def oriented(
     file: Path, rotation: np.ndarray, order: str | None, order_from: str, options: Options
 ) -> tuple[np.ndarray, Fact]:
@@ -263,7 +259,7 @@ def oriented(
     other = ORDERS[1 - ORDERS.index(order)]
     if not len(rotation):
         return read[order], Fact("quaternion", order, order_from)
-    usual, swapped = up(read[order]), up(read[other])
+    usual, swapped = rotations.up(read[order]), rotations.up(read[other])
     if usual.max() < 0:
         if swapped.min() > 0:
             return read[other], Fact("quaternion", other, f"as {order} the root is upside down in all rows")

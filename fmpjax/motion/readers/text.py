@@ -119,7 +119,7 @@ def _rows(
     expected = 7 + len(kept_joints(robot, options.without))
     if named is None and columns != expected:
         raise UserError(
-            f"{file}: line {1 + first} has {columns} columns, expected {expected}: root xyz, quaternion xyzw and "
+            f"{file}: line {1 + first} has {columns} columns, expected {expected} for root xyz, quaternion xyzw and "
             f"{expected_joints(robot, columns - 7, options)}"
         )
     for number, count in enumerate(counts, 1 + first):
