@@ -204,21 +204,30 @@ class Synthesize:
 
 @dataclasses.dataclass(frozen=True)
 class Retarget:
-    """Put a human's motion capture (BVH, LaFAN1's or CMU's skeleton) on a robot by inverse kinematics."""
+    """Put a human's motion capture (BVH) on a robot by inverse kinematics; exit code 1 where the result is broken."""
 
     file: tyro.conf.Positional[Path]
     """Motion capture, .bvh."""
     out: Path
     """File to write, .npz."""
     frames: str | None = None
-    """Frames first:last of the file, 0-based, both included."""
+    """Frames first:last of the file, 0-based, both included; 1: goes to the end."""
     robot: str = "unitree_g1"
     """A robot under robots/."""
+    skeleton: Path | None = None
+    """TOML file with the skeleton's joints of parts whose names are not known, as left_hip = "LThigh"."""
+    up: str | None = None
+    """The file's axis that is up, y or z; by default the one along which hips are over ankles."""
 
     def __call__(self) -> None:
         from fmpjax.motion import retarget
 
-        print(retarget.convert(self.file, robots.load(self.robot), self.out, self.frames))
+        said, broken = retarget.convert(
+            self.file, robots.load(self.robot), self.out, self.frames, skeleton=self.skeleton, up=self.up
+        )
+        print(said)
+        if broken:
+            sys.exit(1)
 
 
 COMMANDS = {

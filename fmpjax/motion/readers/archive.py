@@ -31,6 +31,9 @@ class Arrays(Mapping):
         except (OSError, EOFError, ValueError, NotImplementedError, zipfile.BadZipFile):
             raise self._unreadable() from None
 
+    def __contains__(self, name: object) -> bool:
+        return name in self._sizes  # a mapping's own would read the array
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._sizes)
 

@@ -39,6 +39,8 @@ def read(file: Path, robot: Robot, options: Options) -> Recording:
     """The recording in a text file."""
     lines = _lines(file, robot)
     separator = next((s for s in SEPARATORS if s in lines[0]), None)
+    if separator == ";" and any("," in line for line in lines[:2]):
+        lines = [line.replace(",", ".") for line in lines]  # decimal commas
     header, first = _header(lines, separator), 0
     if header is not None:
         lines, first = lines[1:], 1
@@ -75,7 +77,7 @@ def _lines(file: Path, robot: Robot) -> list[str]:
         size = file.stat().st_size
         if size > MOST_BYTES:
             raise UserError(f"{file}: the file has {size} bytes, expected at most {MOST_BYTES}")
-        text = file.read_text("utf-8-sig").rstrip()
+        text = file.read_text("utf-8-sig").rstrip("\r\n ")
     except UnicodeDecodeError:
         raise UserError(f"{file}: neither text nor an archive nor a pickle, expected a motion") from None
     except OSError as error:
@@ -105,15 +107,13 @@ def _rows(
     file: Path, lines: list[str], separator: str | None, first: int, named: int | None, robot: Robot, options: Options
 ) -> np.ndarray:
     """The numbers ``[T, columns]``."""
-    if separator == ";" and "," in lines[0]:
-        lines = [line.replace(",", ".") for line in lines]  # decimal commas
     if separator is None:
         split = [line.split() for line in lines]
         counts = list(map(len, split))
     else:
-        trailing = all(line.rstrip().endswith(separator) for line in lines)
+        trailing = all(line.rstrip("\r ").endswith(separator) for line in lines)
         if trailing:
-            lines = [line.rstrip()[:-1] for line in lines]
+            lines = [line.rstrip("\r ")[:-1] for line in lines]
         counts = [line.count(separator) + 1 if line.strip() else 0 for line in lines]
     columns = named or counts[0]
     expected = 7 + len(kept_joints(robot, options.without))
