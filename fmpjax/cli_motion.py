@@ -75,6 +75,10 @@ class Import(Reading):
     """Bend the last 0.4 s so that the end meets the start."""
     repeat: int = 1
     """Write a loop so many times on end."""
+    speed: float = 1.0
+    """Play so many times as fast."""
+    join: bool = False
+    """Write the files as one motion, each beginning where the one before has ended."""
 
     def __call__(self) -> None:
         from fmpjax.motion import check, edit
@@ -85,22 +89,26 @@ class Import(Reading):
             raise UserError(f"--repeat is {self.repeat}: expected at least 1")
         if self.heading is not None and not math.isfinite(self.heading):
             raise UserError(f"--heading is {self.heading}: expected degrees")
-        several = len(self.files) > 1
+        several = len(self.files) > 1 and not self.join
         paths = [self.out / f"{Path(file).stem}.npz" if several else self.out for file in self.files]
-        if len(set(paths)) < len(paths):
+        if several and len(set(paths)) < len(paths):
             raise UserError("two of the files have the same name: import them one by one")
         robot = robots.load(self.robot)
         clips = []
         for file in self.files:
             clip = motion.load(file, rate=self.rate, **self.options())
+            if self.speed != 1:
+                clip = edit.faster(clip, self.speed)
             if self.mirror:
                 clip = edit.mirrored(robot, clip)
             if self.heading is not None:
                 clip = edit.headed(clip, math.radians(self.heading))
             clip = edit.looped(clip) if self.loop else clip
             clips.append(edit.repeated(clip, self.repeat) if self.repeat > 1 else clip)
-        for file, clip, path in zip(self.files, clips, paths, strict=True):
+        for file, clip in zip(self.files, clips, strict=True):
             print(f"{file} was read as\n{clip.reading}")
+        clips = [edit.joined(clips)] if self.join else clips
+        for clip, path in zip(clips, paths, strict=not self.join):
             for warning in check.faults(robot, clip):
                 print(f"  warning: {warning}")
             print(f"wrote {motion.save(clip, path)}: {len(clip)} samples, {clip.duration:.2f} s at {clip.rate:g} Hz")
@@ -230,8 +238,37 @@ class Retarget:
             sys.exit(1)
 
 
+@dataclasses.dataclass(frozen=True)
+class Segment(Source):
+    """Find the stretches of a long motion that can be trained: walking, running, turning, dancing, standing."""
+
+    least: float = 2.0
+    """Length of a stretch at least, s."""
+    out: Path | None = None
+    """Folder to write the stretches to that are not broken, as NAME-KIND-FIRST.npz."""
+    picture: Path | None = None
+    """Picture of speed and kinds over time, .png."""
+
+    def __call__(self) -> None:
+        from fmpjax.motion import formats, segment
+        from fmpjax.viz import clip as show
+
+        robot = robots.load(self.robot)
+        clip, _ = self.clip()
+        offset = 0 if self.frames is None else formats.span(self.frames, len(clip))[0]
+        found, kinds = segment.segment(robot, clip, self.least, offset)
+        print(f"{self.file} was read as\n{clip.reading}\n\n{segment.table(clip, found, kinds)}")
+        if self.picture is not None:
+            print(f"wrote {show.timeline(clip, found, self.picture)}")
+        if self.out is not None:
+            for stretch in found:
+                if stretch.verdict != "broken":
+                    print(f"wrote {motion.save(stretch.clip, self.out / f'{stretch.clip.name}.npz')}")
+
+
 COMMANDS = {
     "import": Import, "check": Check, "view": View, "plot": Plot, "synthesize": Synthesize, "retarget": Retarget,
+    "segment": Segment,
 }  # fmt: skip
 
 Motion = functools.reduce(
