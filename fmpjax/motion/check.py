@@ -1,6 +1,7 @@
 """Whether a clip is fit to learn from: figures with healthy ranges, and a verdict for each."""
 
 import copy
+import dataclasses
 from typing import NamedTuple
 
 import mujoco
@@ -16,6 +17,8 @@ from fmpjax.robots import Robot
 CONTACT = 0.01  # m, a sole point below this height counts as standing
 BEARING = 0.03  # m, a sole point at this height bears nothing, one on the floor its share
 DAMPING = 1e-3  # keeps forces finite where few points are near the floor
+PIECE, LEAST_PIECE = 5000, 10  # samples that are checked at once, for memory, and that are worth it
+MOST_PACE = 60.0  # s in which strides are looked for
 WAY = 0.5  # m; a root that ends nearer to its start has no way
 TURNED, HEADED = np.radians(45), np.radians(20)  # from where a motion turns, or heads off +x
 CLOSED = 0.3  # rad between the last pose and the first of a motion that loops
@@ -53,6 +56,9 @@ RANGES = {
 }
 
 
+_VERDICTS = ("good", "odd", "broken")
+
+
 class Figure(NamedTuple):
     """One figure of a clip; ``where`` names the joint or the time of the worst value."""
 
@@ -69,8 +75,8 @@ class Figure(NamedTuple):
         return "good" if span.low <= self.value <= span.high else "odd"
 
 
-def check(robot: Robot, clip: MotionClip, flips: int = 0) -> list[Figure]:
-    """The figures of a clip, in the order of `RANGES`.
+def check(robot: Robot, clip: MotionClip, flips: int = 0, start: float = 0.0) -> list[Figure]:
+    """The figures of a clip that begins at ``start`` s, in the order of `RANGES`.
 
     ``duration``; ``speed``, the root's mean over the floor; ``limit excess`` of a joint beyond its limit; greatest
     ``joint speed`` and, from second differences, ``joint acceleration``, ``root acceleration``; ``root turn``, its
@@ -82,7 +88,7 @@ def check(robot: Robot, clip: MotionClip, flips: int = 0) -> list[Figure]:
     ``loop gap``, the greatest angle between the last pose and the first.
     """
     joints, rate = clip.qpos[:, 7:], clip.rate
-    names, times = robot.joint_names, np.arange(len(clip)) / rate
+    names, times = robot.joint_names, start + np.arange(len(clip)) / rate
     points, rotation = sole_points(robot, clip.qpos)
     height = points[..., 2] - robot.sole_radius
     lowest = height.min(axis=1)
@@ -187,7 +193,8 @@ def pace(robot: Robot, clip: MotionClip) -> tuple[float, float]:
     Lengths do not depend on a file's rate, so a wrong rate shows.
     """
     left, right = robot.sagittal_joints[0], robot.sagittal_joints[3]
-    swing = clip.qpos[:, 7 + left] - clip.qpos[:, 7 + right]
+    rows = slice(0, int(MOST_PACE * clip.rate))
+    swing = clip.qpos[rows, 7 + left] - clip.qpos[rows, 7 + right]
     swing = swing - swing.mean()
     lags = np.arange(int(0.3 * clip.rate), min(int(3 * clip.rate), len(swing) * 2 // 3))
     if len(lags) < 3 or swing.std() < 0.1:
@@ -196,7 +203,7 @@ def pace(robot: Robot, clip: MotionClip) -> tuple[float, float]:
     peaks = np.flatnonzero((alike[1:-1] >= alike[:-2]) & (alike[1:-1] >= alike[2:]) & (alike[1:-1] > STEADY)) + 1
     if not len(peaks):
         return 1.0, 0.0
-    speed = np.linalg.norm(np.diff(clip.qpos[:, :2], axis=0), axis=1).mean() * clip.rate
+    speed = np.linalg.norm(np.diff(clip.qpos[rows, :2], axis=0), axis=1).mean() * clip.rate
     hip, stride = robot.default_qpos[2], speed * lags[peaks[0]] / clip.rate
     if stride < 0.5 * hip:
         return 1.0, 0.0
@@ -204,12 +211,23 @@ def pace(robot: Robot, clip: MotionClip) -> tuple[float, float]:
 
 
 def faults(robot: Robot, clip: MotionClip) -> list[str]:
-    """A sentence per figure that is not good, broken ones first."""
-    figures = [figure for figure in check(robot, clip) if figure.verdict != "good"]
-    figures.sort(key=lambda figure: figure.verdict != "broken")
+    """A sentence per figure that is not good, broken ones first; a long clip is checked in pieces of `PIECE` samples."""
+    worst: dict[str, Figure] = {}
+    for first in range(0, max(1, len(clip) - 1), PIECE - 1):
+        rows = slice(first, first + PIECE)
+        piece = clip if len(clip) <= PIECE else dataclasses.replace(clip, qpos=clip.qpos[rows], qvel=clip.qvel[rows])
+        if len(piece) < LEAST_PIECE < len(clip):
+            continue
+        for figure in check(robot, piece, start=first / clip.rate):
+            known = worst.setdefault(figure.name, figure)
+            if (_VERDICTS.index(figure.verdict), figure.value) > (_VERDICTS.index(known.verdict), known.value):
+                worst[figure.name] = figure
+    worst["duration"] = Figure("duration", clip.duration)
+    figures = sorted(worst.values(), key=lambda figure: -_VERDICTS.index(figure.verdict))
     return [
         f"{f.name} is {f.verdict}: {_value(f)}, healthy {_healthy(f)}{f' ({f.where})' if f.where else ''}"
         for f in figures
+        if f.verdict != "good"
     ]
 
 

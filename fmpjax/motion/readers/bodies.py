@@ -43,6 +43,7 @@ TOLERANCE = 0.05  # m, mean distance of a body from its place
 DISTINCT = 2.0  # an order is proved where the next one is so many times further off
 EXACT = 1e-3  # m, to which files are written
 SAME = 0.02  # rad; orders that differ less need no proof
+MOST_BODIES = 1000
 LEAST_BODIES = 3  # that prove anything, besides the root
 JOINT_NAMES, BODY_NAMES = ("joint_names", "dof_names"), ("body_names", "rigid_body_names", "link_body_list")
 
@@ -91,6 +92,8 @@ def _read(dialect: Dialect, file: Path, content: Mapping, robot: Robot, options:
     rate = positive(file, "fps", content["fps"])
     if not (places.shape[1] and turns.shape[1]):
         raise UserError(f"{file}: no bodies in {dialect.places} or {dialect.turns}, expected the root first")
+    if places.shape[1] > MOST_BODIES:
+        raise UserError(f"{file}: {places.shape[1]} bodies in {dialect.places}, expected at most {MOST_BODIES}")
     if places.shape[:2] != turns.shape[:2]:
         raise UserError(
             f"{file}: {dialect.places} is of {places.shape[:2]} frames and bodies, {dialect.turns} of {turns.shape[:2]}"

@@ -22,8 +22,9 @@ def read(file: Path, content: Mapping, robot: Robot, options: Options) -> Record
     """The recording in a LocoMuJoCo trajectory."""
     names = texts(file, "joint_names", content["joint_names"])
     qpos = table(file, "qpos", content["qpos"], 6 + len(names), what=f"a free root and {len(names) - 1} hinges")
-    if "split_points" in content and np.size(content["split_points"]) > 2:
-        raise UserError(f"{file}: the file holds {np.size(content['split_points']) - 1} trajectories, expected one")
+    points = content.get("split_points")
+    if isinstance(points, np.ndarray) and points.size > 2:
+        raise UserError(f"{file}: the file holds {points.size - 1} trajectories, expected one")
     return assemble(
         file,
         robot,

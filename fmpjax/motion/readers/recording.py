@@ -69,7 +69,9 @@ def positive(file: Path, name: str, value) -> float:
 
 def table(file: Path, name: str, value, *shape: int, what: str = "") -> np.ndarray:
     """``value`` as finite float64 ``[T, *shape]``; -1 stands for any length."""
-    array = np.asarray(value)
+    if not isinstance(value, np.ndarray):  # a pickle's nested lists could unfold without end
+        raise UserError(f"{file}: {name} is {_kind(value)}, expected an array of numbers{f' ({what})' if what else ''}")
+    array = value
     fits = array.ndim == 1 + len(shape) and all(n in (-1, m) for n, m in zip(shape, array.shape[1:], strict=True))
     if array.dtype.kind not in "fiu" or not fits or len(array) > MOST_SAMPLES:
         wanted = ", ".join(["T", *("any" if n < 0 else str(n) for n in shape)])
