@@ -156,6 +156,7 @@ def test_fewer_joints_by_the_stated_words(tmp_path, qpos):
     expected[:, [7 + i for i in WRISTS]] = 0
     same(clip, expected)
     assert clip.reading.warnings[0].startswith("6 joints that the file lacks are at zero: left_wrist_roll_joint")
+    assert clip.reading.warnings[1].startswith("--without waist_roll,waist_pitch,wrist_pitch,wrist_yaw leaves as many")
     refused(path, "expected 34 for", without="wrist_roll")
     with pytest.raises(UserError, match="no joint of robot 'unitree_g1' has 'thumb' in its name"):
         motion.load(path, without="thumb")

@@ -211,7 +211,7 @@ def pace(robot: Robot, clip: MotionClip) -> tuple[float, float]:
 
 
 def faults(robot: Robot, clip: MotionClip) -> list[str]:
-    """A sentence per figure that is not good, broken ones first; a long clip is checked in pieces of `PIECE` samples."""
+    """A sentence per figure that is not good, broken ones first; a long clip is checked in pieces."""
     worst: dict[str, Figure] = {}
     for first in range(0, max(1, len(clip) - 1), PIECE - 1):
         rows = slice(first, first + PIECE)

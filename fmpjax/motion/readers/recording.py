@@ -224,7 +224,21 @@ def by_order(
         why = f"{why}; --without {','.join(options.without)}"
     index = np.full(robot.joint_count, -1)
     index[kept] = columns
-    return Columns(index, Fact("joints", f"{len(kept)} in {order}", why), _lacking(robot, index))
+    return Columns(
+        index, Fact("joints", f"{len(kept)} in {order}", why), (*_lacking(robot, index), *_doubts(robot, kept, why))
+    )
+
+
+def _doubts(robot: Robot, kept: np.ndarray, why: str) -> tuple[str, ...]:
+    """A sentence for each other set of joints ``[N]`` that the file may hold as well, where nothing proves which."""
+    if not why.startswith("assumed"):
+        return ()
+    sets = ((words, kept_joints(robot, words)) for words in WITHOUT)
+    return tuple(
+        f"--without {','.join(words)} leaves as many joints, and the file does not prove which: look at the result"
+        for words, other in sets
+        if len(other) == len(kept) and not np.array_equal(other, kept)
+    )
 
 
 def _lacking(robot: Robot, index: np.ndarray) -> tuple[str, ...]:
