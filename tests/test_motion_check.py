@@ -459,6 +459,14 @@ def test_segment_command(tmp_path, capsys, long):
     assert code("segment", path, "--picture", tmp_path / "a.pdf") == 2
 
 
+def test_a_fast_walk_is_no_run(external, robot):
+    clip = motion.load(external("walk1_subject1.csv"), frames="3180:3450", rate=30.0)
+    found, _ = segment.segment(robot, clip)
+    assert {s.kind for s in found} <= {"walking", "turning"} and sum(len(s.clip) for s in found) > 200
+    clip = motion.load(external("run1_subject2.csv"), frames="3831:4004", rate=30.0)
+    assert {s.kind for s in segment.segment(robot, clip)[0]} == {"running"}
+
+
 def test_the_papers_stretch_is_found(external, robot):
     clip = motion.load(external("walk1_subject1.csv"), frames="2300:2700", rate=30.0)
     found, _ = segment.segment(robot, clip, offset=2300)

@@ -96,6 +96,8 @@ def test_a_root_on_its_side_that_stands_in_the_other_order_is_refused(tmp_path, 
 def test_degrees_are_refused_with_the_option_that_reads_them(tmp_path, qpos):
     path = text(tmp_path / "a.csv", qpos, degrees=True)
     refused(path, "they look like degrees", "--degrees")
+    header = ["x", "y", "z", "qx", "qy", "qz", "qw", *(f"{name} (deg)" for name in NAMES)]
+    refused(text(tmp_path / "b.csv", qpos, degrees=True, header=header), "they look like degrees")
     clip = motion.load(path, fps=RATE, degrees=True)
     same(clip, qpos)
     assert fact(clip, "angles") == ("degrees", "--degrees")

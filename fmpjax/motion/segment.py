@@ -24,7 +24,7 @@ LOW, TILTED = 0.65, 0.5  # of the default pose's root height, and cosine of tilt
 SETTLE = 0.5  # s around a fall that are left out with it
 # Froude numbers v²/(g h) from which a robot walks, runs where it flies, and runs: 0.25, 1.0 and 2.0 m/s on a G1.
 WALKS, FLIES, RUNS = 0.008, 0.13, 0.52
-FLIGHT, OFF = 0.1, 0.01  # share of the time in which both soles are higher than so many m
+FLIGHT, OFF = 0.05, 0.015  # share of the time in which both soles are higher than so many m
 TURNS = 0.3  # rad/s
 MOVES = 0.6  # rad/s, root mean square over the joints
 

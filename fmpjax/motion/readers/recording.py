@@ -258,9 +258,9 @@ def kept_joints(robot: Robot, without: Sequence[str]) -> np.ndarray:
 
 
 def plain_name(name: str) -> str:
-    """A joint's or body's name without what programs put around it: case, "joint", "dof", "pos"."""
+    """A joint's or body's name without what programs put around it: case, "joint", "dof", units."""
     words = re.findall(r"[a-z0-9]+", str(name)[:200].lower())
-    return "_".join(word for word in words if word not in ("joint", "dof", "pos", "angle", "link", "rad"))
+    return "_".join(word for word in words if word not in ("joint", "dof", "pos", "angle", "link", "rad", "deg"))
 
 
 def oriented(
