@@ -426,7 +426,8 @@ def test_stretches_of_a_long_motion(robot, long):
     assert found[3].turning == pytest.approx(0.5, abs=0.1)
     assert found[0].verdict == "good" and found[2].verdict != "broken"
     assert (kinds[-150:] == segment.DOWN).all()
-    assert segment.segment(robot, long, least=6.0)[0] == []
+    assert [s.kind for s in segment.segment(robot, long, least=6.0)[0]] == ["turning"]  # the moving ones together
+    assert segment.segment(robot, long, least=20.0)[0] == []
     with pytest.raises(UserError, match="--least is 0.5: expected at least 1 s"):
         segment.segment(robot, long, least=0.5)
 

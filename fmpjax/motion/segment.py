@@ -4,6 +4,7 @@ Each sample gets a kind from what its neighborhood of `WINDOW` s does; stretches
 measured by `check`. Speeds scale with the robot's hip height by the Froude number, so the limits serve every robot.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from fmpjax.motion.soles import sole_points
 from fmpjax.robots import Robot
 
 KINDS = ("standing", "dancing", "walking", "turning", "running")
+MOVING = ("walking", "turning", "running")
 DOWN, BROKEN = "down", "broken"  # kinds that are left out
 WINDOW = 1.0  # s
 LEAST = 2.0  # s of a stretch, by default
@@ -53,13 +55,36 @@ def segment(robot: Robot, clip: MotionClip, least: float = LEAST, offset: int = 
     """
     if not 1.0 <= least < np.inf:
         raise UserError(f"--least is {least:g}: expected at least 1 s, which training needs")
-    kind = kinds(robot, clip)
+    kind = _merged(kinds(robot, clip), least * clip.rate)
     edges = np.flatnonzero(kind[1:] != kind[:-1]) + 1
     found = []
     for first, end in zip([0, *edges], [*edges, len(kind)], strict=True):
         if kind[first] in KINDS and (end - 1 - first) / clip.rate >= least:
             found.append(_measured(robot, clip, int(first), int(end) - 1, str(kind[first]), offset))
     return found, kind
+
+
+def _merged(kind: np.ndarray, least: float) -> np.ndarray:
+    """Kinds ``[T]`` in which neighbors that move and are shorter than ``least`` samples are one stretch.
+
+    A walk that turns every second is a turn; what walks and runs in turn is what it does most.
+    """
+    out = kind.copy()
+    edges = [0, *(np.flatnonzero(kind[1:] != kind[:-1]) + 1), len(kind)]
+    group: list[int] = []  # edges of the neighbors so far
+    for first, end in [*itertools.pairwise(edges), (len(kind), len(kind))]:
+        short = end - first <= least and first < len(kind) and kind[first] in MOVING
+        if short:
+            group = group or [first]
+            group.append(end)
+            continue
+        if len(group) > 2:
+            part = kind[group[0] : group[-1]]
+            share = [np.mean(part == name) for name in MOVING]
+            most = MOVING[int(np.argmax(share))]
+            out[group[0] : group[-1]] = "turning" if most != "running" and "turning" in part else most
+        group = []
+    return out
 
 
 def kinds(robot: Robot, clip: MotionClip) -> np.ndarray:
