@@ -158,6 +158,7 @@ class Train:
         # Before there is a folder, which the corrected command would find taken.
         if devices != 1:
             sharding.check_divides(config.env.count, self.seeds or 1, sharding.mesh(devices).size)
+        print(runs.describe(config), flush=True)
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
         folder = self.run or Path("runs") / f"{config.method}-{stamp}"
         if self.seeds is None:

@@ -16,74 +16,101 @@ from fmpjax.motion import MotionClip, gait
 from fmpjax.motion.gait import Style
 
 
-@dataclasses.dataclass(frozen=True)
-class Source:
-    """A motion in a file."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How a motion file is read."""
 
-    file: tyro.conf.Positional[str]
-    """A motion file of any format, or a bundled motion's name."""
     frames: str | None = None
-    """Source rows first:last, 0-based, both included."""
+    """Source rows first:last, 0-based, both included; 100: and :200 go to the file's end or from its start."""
     fps: float | None = None
     """Rate of the source rows in place of the file's own, Hz."""
     robot: str = "unitree_g1"
     """A robot under robots/."""
+    quaternion: str | None = None
+    """Order of the root's quaternion in place of the format's: wxyz or xyzw."""
+    without: str = ""
+    """Words, as wrist,waist_roll: the file lacks the joints with one in their name, and they are zero."""
+    degrees: bool = False
+    """The file's joints are in degrees."""
+
+    def options(self) -> dict[str, object]:
+        """What `fmpjax.motion.load` is told."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(Reading)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Source(Reading):
+    """A motion in a file."""
+
+    file: tyro.conf.Positional[str]
+    """A motion file of any format, or a bundled motion's name."""
 
     def clip(self) -> tuple[MotionClip, int]:
         """The clip at the file's own rate, and how often its quaternion flips in the file."""
         from fmpjax.motion import check, formats
 
-        file, recording = formats.record(self.file, fps=self.fps, frames=self.frames, robot=self.robot)
+        file, recording = formats.record(self.file, **self.options())
         if len(recording.qpos) < formats.LEAST_SAMPLES:
             raise UserError(f"{file}: {len(recording.qpos)} frames, expected at least {formats.LEAST_SAMPLES}")
         clip = MotionClip.from_qpos(file.stem, self.robot, recording.rate, recording.qpos)
+        clip = dataclasses.replace(clip, reading=recording.reading)
         return clip, check.flips(recording.qpos[:, 3:7])
 
 
 @dataclasses.dataclass(frozen=True)
-class Import:
+class Import(Reading):
     """Read motions of any format and write them as this package's own."""
 
     files: tyro.conf.Positional[tuple[str, ...]]
     """Motion files; several are written to the folder --out under their own names."""
     out: Path
     """File to write, .npz; a folder for several files."""
-    frames: str | None = None
-    """Source rows first:last, 0-based, both included."""
-    fps: float | None = None
-    """Rate of the source rows in place of the file's own, Hz."""
     rate: float = 50.0
     """Rate to write, Hz."""
-    robot: str = "unitree_g1"
-    """A robot under robots/."""
     mirror: bool = False
     """Reflect left and right."""
     heading: float | None = None
     """Turn the way from start to end to this angle from +x, deg."""
     loop: bool = False
     """Bend the last 0.4 s so that the end meets the start."""
+    repeat: int = 1
+    """Write a loop so many times on end."""
+    speed: float = 1.0
+    """Play so many times as fast."""
+    join: bool = False
+    """Write the files as one motion, each beginning where the one before has ended."""
 
     def __call__(self) -> None:
-        from fmpjax.motion import edit
+        from fmpjax.motion import check, edit
 
         if not self.files:
             raise UserError("no file to import: expected at least one")
+        if self.repeat < 1:
+            raise UserError(f"--repeat is {self.repeat}: expected at least 1")
         if self.heading is not None and not math.isfinite(self.heading):
             raise UserError(f"--heading is {self.heading}: expected degrees")
-        several = len(self.files) > 1
+        several = len(self.files) > 1 and not self.join
         paths = [self.out / f"{Path(file).stem}.npz" if several else self.out for file in self.files]
-        if len(set(paths)) < len(paths):
+        if several and len(set(paths)) < len(paths):
             raise UserError("two of the files have the same name: import them one by one")
         robot = robots.load(self.robot)
         clips = []
         for file in self.files:
-            clip = motion.load(file, fps=self.fps, frames=self.frames, rate=self.rate, robot=self.robot)
+            clip = motion.load(file, rate=self.rate, **self.options())
+            if self.speed != 1:
+                clip = edit.faster(clip, self.speed)
             if self.mirror:
                 clip = edit.mirrored(robot, clip)
             if self.heading is not None:
                 clip = edit.headed(clip, math.radians(self.heading))
-            clips.append(edit.looped(clip) if self.loop else clip)
-        for clip, path in zip(clips, paths, strict=True):
+            clip = edit.looped(clip) if self.loop else clip
+            clips.append(edit.repeated(clip, self.repeat) if self.repeat > 1 else clip)
+        for file, clip in zip(self.files, clips, strict=True):
+            print(f"{file} was read as\n{clip.reading}")
+        clips = [edit.joined(clips)] if self.join else clips
+        for clip, path in zip(clips, paths, strict=not self.join):
+            for warning in check.faults(robot, clip):
+                print(f"  warning: {warning}")
             print(f"wrote {motion.save(clip, path)}: {len(clip)} samples, {clip.duration:.2f} s at {clip.rate:g} Hz")
 
 
@@ -95,6 +122,12 @@ class Check(Source):
     """Put the soles on the floor, take out flips, clip joints to their limits, say what was changed, check again."""
     out: Path | None = None
     """File to write the fixed motion to, .npz."""
+    axes: str = "world"
+    """The run's features.axes, world or heading."""
+    reset: str = "dataset"
+    """The run's env.reset, dataset or fixed."""
+    seconds: float = 10.0
+    """Length of the run's evaluation."""
 
     def __call__(self) -> None:
         from fmpjax.motion import check, edit
@@ -104,7 +137,9 @@ class Check(Source):
         robot = robots.load(self.robot)
         clip, flips = self.clip()
         figures = check.check(robot, clip, flips)
-        print(check.table(figures))
+        print(f"{self.file} was read as\n{clip.reading}\n\n{check.table(figures)}")
+        for sentence in check.unsuited(robot, clip, axes=self.axes, reset=self.reset, seconds=self.seconds):
+            print(f"\nnote: {sentence}")
         if self.fix:
             clip, changes = edit.fixed(robot, clip)
             changes += [f"{flips} flips of the quaternion taken out"] * bool(flips)
@@ -180,25 +215,63 @@ class Synthesize:
 
 @dataclasses.dataclass(frozen=True)
 class Retarget:
-    """Put a human's motion capture (BVH, LaFAN1's or CMU's skeleton) on a robot by inverse kinematics."""
+    """Put a human's motion capture (BVH) on a robot by inverse kinematics; exit code 1 where the result is broken."""
 
     file: tyro.conf.Positional[Path]
     """Motion capture, .bvh."""
     out: Path
     """File to write, .npz."""
     frames: str | None = None
-    """Frames first:last of the file, 0-based, both included."""
+    """Frames first:last of the file, 0-based, both included; 1: goes to the end."""
     robot: str = "unitree_g1"
     """A robot under robots/."""
+    skeleton: Path | None = None
+    """TOML file with the skeleton's joints of parts whose names are not known, as left_hip = "LThigh"."""
+    up: str | None = None
+    """The file's axis that is up, y or z; by default the one along which hips are over ankles."""
 
     def __call__(self) -> None:
         from fmpjax.motion import retarget
 
-        print(retarget.convert(self.file, robots.load(self.robot), self.out, self.frames))
+        said, broken = retarget.convert(
+            self.file, robots.load(self.robot), self.out, self.frames, skeleton=self.skeleton, up=self.up
+        )
+        print(said)
+        if broken:
+            sys.exit(1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Segment(Source):
+    """Find the stretches of a long motion that can be trained: walking, running, turning, dancing, standing."""
+
+    least: float = 2.0
+    """Length of a stretch at least, s."""
+    out: Path | None = None
+    """Folder to write the stretches to that are not broken, as NAME-KIND-FIRST.npz."""
+    picture: Path | None = None
+    """Picture of speed and kinds over time, .png."""
+
+    def __call__(self) -> None:
+        from fmpjax.motion import formats, segment
+        from fmpjax.viz import clip as show
+
+        robot = robots.load(self.robot)
+        clip, _ = self.clip()
+        offset = 0 if self.frames is None else formats.span(self.frames, len(clip))[0]
+        found, kinds = segment.segment(robot, clip, self.least, offset)
+        print(f"{self.file} was read as\n{clip.reading}\n\n{segment.table(clip, found, kinds)}")
+        if self.picture is not None:
+            print(f"wrote {show.timeline(clip, found, self.picture)}")
+        if self.out is not None:
+            for stretch in found:
+                if stretch.verdict != "broken":
+                    print(f"wrote {motion.save(stretch.clip, self.out / f'{stretch.clip.name}.npz')}")
 
 
 COMMANDS = {
     "import": Import, "check": Check, "view": View, "plot": Plot, "synthesize": Synthesize, "retarget": Retarget,
+    "segment": Segment,
 }  # fmt: skip
 
 Motion = functools.reduce(

@@ -61,7 +61,6 @@ class Robot:
     sagittal_joints: np.ndarray  # [6] indices: left hip, knee, ankle, then right
     total_mass: float  # kg
     self_collision: bool  # whether its bodies touch each other
-    takes_motions_of: tuple[str, ...]  # robots whose motions it takes as they are, beside its own
     landmarks: dict[str, int]  # index of the body that stands for a human's pelvis, chest, left_hip and so on
     gait: dict[str, Any]  # its walk, as `fmpjax.motion.gait` reads it; empty for a robot without one
     view_distance: float  # m from which a picture shows it whole
@@ -90,8 +89,8 @@ class Robot:
         return model
 
     def takes(self, other: str) -> bool:
-        """Whether motions that were made for the robot named ``other`` are this robot's, too."""
-        return other in (self.name, *self.takes_motions_of)
+        """Whether motions of the robot named ``other`` are this robot's, too: its joints and their order are the same."""
+        return other == self.name or (other in available() and load(other).joint_names == self.joint_names)
 
 
 def available() -> list[str]:
@@ -156,7 +155,6 @@ def _read(name: str, path: Path) -> Robot:
         sagittal_joints=np.array([index[j] for j in facts["sagittal_joints"]]),
         total_mass=float(model.body_mass.sum()),
         self_collision=bool((model.geom_conaffinity[model.geom_bodyid > 0] != 0).any()),
-        takes_motions_of=tuple(facts.get("takes_motions_of", ())),
         landmarks={part: model.body(body).id - 1 for part, body in facts.get("landmarks", {}).items()},
         gait=facts.get("gait", {}),
         view_distance=facts["camera"]["distance"],

@@ -87,3 +87,8 @@ def yaw(q_wxyz):
     xp = _library(q_wxyz)
     w, x, y, z = (q_wxyz[..., i] for i in range(4))
     return xp.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+
+
+def up(q_wxyz):
+    """Cosine of the tilt of the rotated z axis, ``[...]``: 1 upright, -1 upside down."""
+    return 1 - 2 * (q_wxyz[..., 1] ** 2 + q_wxyz[..., 2] ** 2)

@@ -23,12 +23,13 @@ import jax
 import numpy as np
 
 from fmpjax import config as configuration
-from fmpjax import diagnose, motion, policy, sharding
+from fmpjax import diagnose, motion, policy, robots, sharding
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import Config
 from fmpjax.errors import UserError, out_of_memory
 from fmpjax.evaluate import Evaluation, Evaluator, table
 from fmpjax.logs import MetricsLog, Progress, clock
+from fmpjax.motion import check
 from fmpjax.train import Trainer, TrainState, stack, unstack
 from fmpjax.viz import curves, render
 
@@ -42,6 +43,22 @@ def load_motion(config: Config) -> motion.MotionLibrary:
     return motion.load_library(
         config.motion, frames=config.frames or None, rate=round(config.control_rate, 6), robot=config.robot
     )
+
+
+def describe(config: Config) -> str:
+    """What the motions of a configuration were read as, and whether they are fit to learn from with its settings."""
+    robot, lines = robots.load(config.robot), []
+    for clip in load_motion(config).clips:
+        lines.append(f"motion {clip.name}, {len(clip)} samples in {clip.duration:.2f} s, was read as\n{clip.reading}")
+        said = check.faults(robot, clip) + check.unsuited(
+            robot,
+            clip,
+            axes=config.features.axes,
+            reset=config.env.reset,
+            seconds=config.env.episode_steps / config.control_rate,
+        )
+        lines += [f"  warning: {sentence}" for sentence in said]
+    return "\n".join(lines)
 
 
 class Run:

@@ -143,7 +143,7 @@ def test_frames_include_both_ends(csv, frames):
 
 
 def test_paper_range_gives_351_samples(tmp_path):
-    path = write_csv(tmp_path / "long.csv", moving(30.0, 240))
+    path = write_csv(tmp_path / "long.csv", moving(120.0, 240))
     assert len(motion.load(path, frames="20:230")) == 351
 
 
@@ -262,7 +262,7 @@ def test_csv_bad_values(csv):
     fails(r"clip\.csv: neither text nor an archive nor a pickle", csv)
 
 
-@pytest.mark.parametrize("frames", ["5", "5:", "a:b", "1:2:3", (1, 2, 3), (1.5, 20), 7, ""])
+@pytest.mark.parametrize("frames", ["5", ":", "a:b", "1:2:3", (1, 2, 3), (1.5, 20), 7, ""])
 def test_frames_syntax(csv, frames):
     fails(r"frames is .*, expected FIRST:LAST, such as 2370:2580", csv, frames=frames)
 
@@ -307,7 +307,7 @@ def npz(path, **arrays):
         ({"robot": "h1"}, r"the motion is for robot 'h1', expected 'unitree_g1'"),
         ({"rate": -1.0}, r"rate is -1.0, expected a positive number of Hz"),
         ({"rate": np.array([50.0, 30.0])}, r"rate is \[50.0, 30.0\], expected"),
-        ({"qpos": np.array([{}])}, r"array 'qpos' holds object, expected numbers or text"),
+        ({"qpos": np.array([{}])}, r"array 'qpos' holds objects, expected numbers or text"),
     ],
 )
 def test_npz_faults(tmp_path, arrays, pattern):

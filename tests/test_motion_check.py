@@ -1,5 +1,6 @@
 """Edits against closed forms and MuJoCo's kinematics, figures against clips with one known fault, and the commands."""
 
+import dataclasses
 import os
 import time
 
@@ -9,8 +10,9 @@ import pytest
 from PIL import Image
 
 from fmpjax import cli, motion, robots, rotations
+from fmpjax import config as configuration
 from fmpjax.errors import UserError
-from fmpjax.motion import MotionClip, check, edit, soles
+from fmpjax.motion import MotionClip, check, edit, segment, soles
 from fmpjax.viz import clip as show
 
 
@@ -106,6 +108,29 @@ def test_fix_puts_the_clip_right(robot, walk):
     assert edit.fixed(robot, clip)[1] == []
 
 
+def test_faster(walk):
+    quick = edit.faster(walk, 1.2)
+    assert len(quick) == 1 + int((len(walk) - 1) / 1.2)
+    np.testing.assert_allclose(quick.qpos[50], walk.qpos[60], atol=1e-12)
+    assert np.abs(quick.qvel[:, 0]).mean() == pytest.approx(1.2 * np.abs(walk.qvel[:, 0]).mean(), rel=0.02)
+    with pytest.raises(UserError, match="--speed is 9: expected a factor from 0.25 to 4"):
+        edit.faster(walk, 9)
+
+
+def test_joined_clips_go_on_where_the_last_ended(robot, walk):
+    turn = motion.load("turn_left")
+    both = edit.joined([turn, walk, turn])
+    assert len(both) == 2 * len(turn) + len(walk) - 2
+    np.testing.assert_array_equal(both.qpos[: len(turn)], turn.qpos)
+    found = figures(robot, both)
+    for name in ("joint speed", "joint acceleration", "root acceleration", "penetration"):
+        assert found[name].verdict == "good"
+    # The walk goes to where the turn looked at its end.
+    way = both.qpos[len(turn) + len(walk) - 2, :2] - both.qpos[len(turn) - 1, :2]
+    assert np.arctan2(way[1], way[0]) == pytest.approx(rotations.yaw(turn.qpos[-1, 3:7]), abs=0.15)
+    assert found["turning"].value == pytest.approx(2 * turn.duration * 0.5 / both.duration, rel=0.1)
+
+
 # --- figures ---------------------------------------------------------------------------------------------------------
 
 
@@ -152,6 +177,75 @@ def test_flips_are_counted():
     q[3:5] *= -1
     assert check.flips(q) == 2
     assert check.Figure("flips", 2).verdict == "odd"
+
+
+def test_upside_down_and_heading(robot, walk):
+    def over(qpos):
+        qpos[:, 3:7] = rotations.multiply(rotations.exp_map(np.array([np.pi, 0.0, 0.0])), qpos[:, 3:7])
+
+    found = figures(robot, changed(walk, over))
+    assert found["tilt"].verdict == "broken" and found["tilt"].value > 170
+    assert any(fault.startswith("tilt is broken") for fault in check.faults(robot, changed(walk, over)))
+    turned = figures(robot, edit.headed(walk, np.radians(60)))["heading"]
+    way = np.degrees(check.heading(walk))
+    assert turned.value == pytest.approx(60, abs=0.1)
+    assert turned.where == f"faces {60 + np.degrees(rotations.yaw(walk.qpos[0, 3:7])) - way:.0f}°"
+    left = figures(robot, motion.load("turn_left"))["turning"]
+    assert left.value == pytest.approx(0.5, abs=0.02)
+
+
+def test_what_does_not_suit_a_run(robot, walk):
+    def said(clip, axes="world", reset="dataset", seconds=10.0):
+        return " ".join(check.unsuited(robot, clip, axes=axes, reset=reset, seconds=seconds))
+
+    left = motion.load("turn_left")
+    assert said(walk) == said(walk, reset="fixed") == said(left, axes="heading") == ""
+    assert "--set features.axes=heading" in said(left)
+    away = edit.headed(walk, np.radians(90))
+    assert said(away) == said(away, axes="heading", reset="fixed") == ""
+    assert "heads 90° from +x" in said(away, reset="fixed")
+    short = MotionClip.from_qpos("short", robot.name, 50.0, walk.qpos[:77])
+    assert "lasts 1.5 s and does not loop, and an evaluation lasts 10 s" in said(short)
+    assert said(short, seconds=1.0) == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "rate", "word"),
+    [
+        ("walk", 100.0, ""),
+        ("walk", 50.0, "faster"),
+        ("walk", 240.0, "slower"),
+        ("fast_walk", 50.0, "faster"),
+        ("slow_walk", 100.0, ""),
+    ],
+)
+def test_strides_give_a_wrong_rate_away(robot, tmp_path, name, rate, word):
+    """A text file without a rate, read at half or twice its speed; a rate that is told is not doubted."""
+    qpos = motion.load(name, rate=100.0).qpos
+    rows = qpos[:, [0, 1, 2, 4, 5, 6, 3, *range(7, qpos.shape[1])]]
+    (tmp_path / "a.csv").write_text("\n".join(",".join(f"{v:.6f}" for v in row) for row in rows))
+    clip = motion.load(tmp_path / "a.csv", fps=rate)
+    told = " ".join(check.unsuited(robot, clip, axes="world", reset="dataset", seconds=1.0))
+    assert "strides" not in told
+    facts = tuple(f._replace(why="assumed") if f.what == "rate" else f for f in clip.reading.facts)
+    clip = dataclasses.replace(clip, reading=clip.reading._replace(facts=facts))
+    told = " ".join(check.unsuited(robot, clip, axes="world", reset="dataset", seconds=1.0))
+    assert ("strides" in told) == bool(word) and word in told
+
+
+def test_a_long_motion_is_checked_in_pieces(robot, walk, monkeypatch):
+    """The same faults, with the times of the whole."""
+
+    def jump(qpos):
+        qpos[200, 20] += 1.0
+
+    clip = changed(walk, jump)
+    whole = check.faults(robot, clip)
+    monkeypatch.setattr(check, "PIECE", 90)
+    assert any("at 4.00 s" in fault for fault in whole)
+    pieces = check.faults(robot, clip)
+    assert [f for f in pieces if f.startswith("joint")] == [f for f in whole if f.startswith("joint")]
+    assert not any("duration" in fault for fault in pieces)
 
 
 def test_not_a_number_is_broken():
@@ -263,6 +357,121 @@ def test_bad_input(tmp_path, monkeypatch, capsys, arguments, word):
     error = capsys.readouterr().err
     assert word in error and error.count("\n") == 1
     assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("reset", ["dataset", "fixed"])
+def test_train_says_what_it_reads_and_warns_first(robot, walk, tmp_path, reset):
+    """What `train` prints before it makes a run's folder."""
+    runs = pytest.importorskip("fmpjax.runs")
+
+    def spoil(qpos):
+        qpos[:, 2] -= 0.2
+
+    path = motion.save(edit.headed(changed(walk, spoil), np.radians(90)), tmp_path / "sunk.npz")
+    config = configuration.preset("smoke", motion=f"{path},turn_left", **{"env.reset": reset})
+    said = runs.describe(config)
+    assert "motion sunk" in said and "fmpjax's .npz" in said and "motion turn_left" in said
+    assert "warning: penetration is broken: 0.2" in said
+    assert ("warning: the motion heads 90° from +x" in said) == (reset == "fixed")
+    assert "--set features.axes=heading" in said
+
+
+def test_train_prints_it(monkeypatch, capsys, tmp_path):
+    runs = pytest.importorskip("fmpjax.runs")
+
+    class Made(Exception):
+        pass
+
+    def create(*_):
+        raise Made
+
+    monkeypatch.setattr(runs.Run, "create", create)
+    with pytest.raises(Made):
+        cli.main(["train", "--preset", "smoke", "--motion", "turn_right", "--run", str(tmp_path / "run")])
+    assert "motion turn_right, " in capsys.readouterr().out
+
+
+# --- stretches -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def long(robot, walk):
+    """Five seconds each of standing, waving, walking, turning, running on the spot's pace, and a fall."""
+    rate, still = walk.rate, np.tile(robot.default_qpos, (250, 1))
+
+    def clip(qpos):
+        return MotionClip.from_qpos("part", robot.name, rate, qpos)
+
+    wave = still.copy()
+    wave[:, 7 + 15 :] += 0.6 * np.sin(2 * np.pi * 1.2 * np.arange(250) / rate)[:, None]
+    fall = still.copy()
+    pitch = np.clip(np.arange(250) / rate, 0, 1) * np.pi / 2
+    fall[:, 3:7] = rotations.exp_map(pitch[:, None] * [0.0, 1.0, 0.0])
+    fall[:, 2] = still[0, 2] * np.cos(pitch) + 0.12
+    run = walk.qpos.copy()
+    run[:, 0] *= 2.6
+    turn = motion.load("turn_left").qpos
+    return edit.joined([clip(q[:250]) for q in (still, wave, walk.qpos, turn, run, fall)])
+
+
+def test_stretches_of_a_long_motion(robot, long):
+    found, kinds = segment.segment(robot, long)
+    assert [s.kind for s in found] == ["standing", "dancing", "walking", "turning", "running"]
+    for i, stretch in enumerate(found):
+        # A second's window blurs the borders; standing before the fall is short.
+        assert abs(stretch.first - 249 * i) < 40 and stretch.last - stretch.first > 170
+        assert len(stretch.clip) == stretch.last - stretch.first + 1
+        np.testing.assert_allclose(stretch.clip.qpos[0, 7:], long.qpos[stretch.first, 7:])
+    assert found[2].speed == pytest.approx(0.86, abs=0.1)
+    assert found[3].turning == pytest.approx(0.5, abs=0.1)
+    assert found[0].verdict == "good" and found[2].verdict != "broken"
+    assert (kinds[-150:] == segment.DOWN).all()
+    assert [s.kind for s in segment.segment(robot, long, least=6.0)[0]] == ["turning"]  # the moving ones together
+    assert segment.segment(robot, long, least=20.0)[0] == []
+    with pytest.raises(UserError, match="--least is 0.5: expected at least 1 s"):
+        segment.segment(robot, long, least=0.5)
+
+
+def test_a_jump_parts_a_walk(robot, walk):
+    def jump(qpos):
+        qpos[150:, 12] += 1.5
+
+    found, kinds = segment.segment(robot, changed(walk, jump))
+    assert [s.kind for s in found] == ["walking", "walking"]
+    assert found[0].last < 150 <= found[1].first
+    assert kinds[150] == segment.BROKEN
+
+
+def test_segment_command(tmp_path, capsys, long):
+    path = motion.save(long, tmp_path / "long.npz")
+    run("segment", path, "--frames", "400:", "--out", tmp_path / "parts", "--picture", tmp_path / "a.png")
+    said = capsys.readouterr().out
+    assert "rows            seconds  kind      m/s    rad/s   verdict" in said
+    walks = [line for line in said.splitlines() if " walking " in line]
+    first, last = map(int, walks[0].split()[0].split(":"))
+    assert 460 < first < 540 and 700 < last < 790
+    written = motion.load(tmp_path / "parts" / f"long-walking-{first}.npz")
+    np.testing.assert_allclose(written.qpos[0, 7:], motion.load(path).qpos[first, 7:])
+    assert "s on the ground or falling" in said
+    assert Image.open(tmp_path / "a.png").size[0] > 1000
+    run("import", path, "walk", "--join", "--speed", "1.25", "--out", tmp_path / "joined.npz")
+    joined = motion.load(tmp_path / "joined.npz").duration
+    assert joined == pytest.approx((long.duration + motion.load("walk").duration) / 1.25, abs=0.05)
+    assert code("segment", path, "--picture", tmp_path / "a.pdf") == 2
+
+
+def test_a_fast_walk_is_no_run(external, robot):
+    clip = motion.load(external("walk1_subject1.csv"), frames="3180:3450", rate=30.0)
+    found, _ = segment.segment(robot, clip)
+    assert {s.kind for s in found} <= {"walking", "turning"} and sum(len(s.clip) for s in found) > 200
+    clip = motion.load(external("run1_subject2.csv"), frames="3831:4004", rate=30.0)
+    assert {s.kind for s in segment.segment(robot, clip)[0]} == {"running"}
+
+
+def test_the_papers_stretch_is_found(external, robot):
+    clip = motion.load(external("walk1_subject1.csv"), frames="2300:2700", rate=30.0)
+    found, _ = segment.segment(robot, clip, offset=2300)
+    assert any(s.kind == "walking" and s.first <= 2370 and s.last >= 2580 and s.verdict == "good" for s in found)
 
 
 @pytest.mark.parametrize(("name", "frames"), [("walk1_subject1.csv", "2370:2580"), ("run1_subject2.csv", "5000:5200")])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fmpjax import cli, motion, rotations
 from fmpjax.errors import UserError
-from fmpjax.motion import bvh, gait, retarget, soles
+from fmpjax.motion import bvh, check, gait, retarget, soles
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 # Joints and their parents, by LaFAN1's names; what is a landmark of the robot; CMU's names.
@@ -217,6 +217,147 @@ def test_any_motion_is_solved_or_refused(robot, source):
         retarget.retarget(source._replace(values=values), robot, "walk")
 
 
+def test_a_part_does_not_depend_on_its_first_frame(robot, source, done):
+    part = retarget.retarget(source, robot, "walk", span=(15, 60))
+    np.testing.assert_allclose(part.contact, done.contact[15:])
+    np.testing.assert_allclose(part.clip.qpos[10:], done.clip.qpos[25:], atol=0.02)
+
+
+def test_feet_that_tilt_beyond_the_ankles_do_not_shake_the_rest(robot, second, read, done):
+    """Human feet roll and tilt further than the robot's ankles can: the joints' accelerations stay the source's."""
+    path_source = read(capture(robot, second))
+    values = path_source.values.copy()
+    t = np.arange(len(values)) / second.rate
+    for i, name in enumerate(("LeftFoot", "RightFoot")):
+        at = 6 * path_source.names.index(name) + 3
+        values[:, at : at + 3] += 35 * np.sin(9 * t + 3 * i)[:, None] * [1.0, 0.3, 1.0]
+    found = retarget.retarget(path_source._replace(values=values), robot, "walk")
+    figures = {figure.name: figure.value for figure in check.check(robot, found.clip)}
+    assert figures["joint acceleration"] < 600
+    assert figures["joint speed"] < 20
+    assert found.residual.max() < 0.08
+    assert figures["limit excess"] == 0
+
+
+def test_z_up_is_told_by_the_legs(robot, second, read, done, tmp_path):
+    """The same file with its root turned so that z is up gives the same motion."""
+    source = read(capture(robot, second))
+    text = turned_up(source)
+    found = retarget.retarget(text, robot, "walk")
+    assert dict((f.what, f.value) for f in found.clip.reading.facts)["up"] == "z"
+    np.testing.assert_allclose(found.clip.qpos[:, 7:], done.clip.qpos[:, 7:], atol=5e-3)
+    lying = retarget.retarget(text, robot, "walk", up="y")
+    verdict, faults = lying.verdict(robot)
+    assert verdict != "good" and any(fault.startswith("tilt is odd") for fault in faults)
+
+
+def turned_up(source):
+    """The skeleton with z up: x, y, z of the file become y, z, x."""
+    values = source.values.copy()
+    values[:, :3] = source.values[:, [2, 0, 1]]
+    euler = Rotation.from_euler("ZYX", source.values[:, 3:6], degrees=True)
+    third = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    values[:, 3:6] = (third * euler).as_euler("ZYX", degrees=True)
+    return source._replace(values=values)
+
+
+def test_bad_fits_are_broken(robot, done):
+    far = done._replace(residual=done.residual + 0.2)
+    verdict, faults = far.verdict(robot)
+    assert verdict == "broken"
+    assert faults[0].startswith("mean residual is broken: 20") and faults[1].startswith("worst residual is odd")
+    assert done.verdict(robot)[0] == "good"
+
+
+XSENS = {"UpLeg": "Hip", "Leg": "Knee", "Foot": "Ankle", "Arm": "Shoulder", "ForeArm": "Elbow", "Hand": "Wrist"}
+UNREAL = {"UpLeg": "thigh", "Leg": "calf", "Foot": "foot", "Toe": "ball", "Arm": "upperarm", "ForeArm": "lowerarm",
+          "Hand": "hand"}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["Xsens", "Unreal", "Mixamo", "SMPL"])
+def test_names_of_other_programs(source, kind):
+    expected = retarget.joints(source, "walk")
+
+    def rename(name):
+        side, limb = (name[:4], name[4:]) if name.startswith("Left") else (name[:5], name[5:])
+        if not name.startswith(("Left", "Right")):
+            return name
+        if kind == "Xsens":
+            return side + XSENS.get(limb, limb)
+        if kind == "Unreal":
+            return f"{UNREAL[limb]}_{side[0].lower()}"
+        if kind == "SMPL":
+            return f"{side[0]}_{ {'Toe': 'Foot'}.get(limb, XSENS.get(limb, limb)) }"
+        return f"mixamorig:{side}{limb.replace('Toe', 'ToeBase')}"
+
+    assert retarget.joints(source._replace(names=tuple(map(rename, source.names))), "walk") == expected
+
+
+def test_a_collar_is_no_shoulder(source):
+    """LaFAN1's LeftShoulder is the collar and LeftArm the shoulder; Xsens has LeftCollar and LeftShoulder."""
+    names = tuple({"Spine": "LeftShoulder"}.get(name, name) for name in source.names)
+    assert retarget.joints(source._replace(names=names), "walk")["left_shoulder"] == source.names.index("LeftArm")
+
+
+def test_a_first_frame_in_another_pose_is_left_out(robot, second, tmp_path, capsys):
+    pytest.importorskip("mink")
+    path, out = tmp_path / "walk.bvh", tmp_path / "walk.npz"
+    lines = capture(robot, second).split("\n")
+    at = next(i for i, line in enumerate(lines) if line.startswith("Frame Time"))
+    first = np.array(lines[at + 1].split(), float).reshape(-1, 6)
+    first[:, 3:] = 0.0
+    first[0, 3:] = [90.0, 0.0, 0.0]
+    lines[at + 1] = " ".join(map(str, first.ravel()))
+    path.write_text("\n".join(lines))
+    cli.main(["motion", "retarget", str(path), "--out", str(out)])
+    said = capsys.readouterr().out
+    assert "warning: frame 0 is another pose, and is left out" in said
+    assert "verdict: good" in said
+    assert len(motion.load(out, rate=30.0)) == len(second) - 1
+    path.write_text(capture(robot, second))
+    cli.main(["motion", "retarget", str(path), "--frames", "15:", "--out", str(out)])
+    assert "another pose" not in capsys.readouterr().out
+    assert len(motion.load(out, rate=30.0)) == len(second) - 15
+
+
+def test_a_skeleton_file_names_the_joints(robot, second, tmp_path, capsys):
+    pytest.importorskip("mink")
+    path, out, mapping = tmp_path / "walk.bvh", tmp_path / "walk.npz", tmp_path / "names.toml"
+    path.write_text(capture(robot, second).replace("LeftLeg", "Knie"))
+
+    def code(*more):
+        with pytest.raises(SystemExit) as end:
+            cli.main(["motion", "retarget", str(path), "--out", str(out), *more])
+        return end.value.code
+
+    assert code() == 2
+    error = capsys.readouterr().err
+    assert "no joint for the left knee" in error and "--skeleton" in error and "Knie" in error
+    for text, word in (
+        ('left_knee = "Knee"', "no joint 'Knee' for left_knee"),
+        ('left_nose = "Knie"', "'left_nose' is no part"),
+        ("left_knee = 3", "'left_knee' is no part with a joint's name"),
+        ("left_knee", "not TOML"),
+    ):
+        mapping.write_text(text)
+        assert code("--skeleton", str(mapping)) == 2
+        assert word in capsys.readouterr().err
+    assert code("--skeleton", str(tmp_path / "nowhere.toml")) == 2
+    assert code("--up", "x") == 2
+    mapping.write_text('left_knee = "Knie"')
+    cli.main(["motion", "retarget", str(path), "--out", str(out), "--skeleton", str(mapping), "--frames", ":30"])
+    assert len(motion.load(out, rate=30.0)) == 31
+
+
+@pytest.mark.parametrize("name", ["cmu_01_01_first120.bvh", "hip_knee_ankle_names_30.bvh"])
+def test_strangers_captures(external, robot, name, tmp_path, capsys):
+    pytest.importorskip("mink")
+    cli.main(["motion", "retarget", str(external(name)), "--out", str(tmp_path / "a.npz")])
+    said = capsys.readouterr().out
+    assert ("frame 0 is another pose" in said) == name.startswith("cmu")
+    assert "broken" not in said
+
+
 # --- faults and the command ------------------------------------------------------------------------------------------
 
 
@@ -226,6 +367,10 @@ def test_faults(robot, source, monkeypatch):
         retarget.retarget(source._replace(names=names), robot, "walk")
     with pytest.raises(UserError, match="walk: the motion has 1 frame at 60 Hz, expected at least two"):
         retarget.retarget(source._replace(rate=240.0, values=source.values[:3]), robot, "walk")
+    with pytest.raises(UserError, match="walk: hips are over ankles neither along y nor along z in most frames"):
+        values = source.values.copy()
+        values[:, 3:6] += [90.0, 0.0, 0.0]  # lies on its side
+        retarget.retarget(source._replace(values=values), robot, "walk")
     with pytest.raises(UserError, match="walk: the skeleton's left_hip and left_knee are at one place"):
         values = source.values.copy()
         at = 6 * source.names.index("LeftLeg")
@@ -240,9 +385,9 @@ def test_faults(robot, source, monkeypatch):
 
 def test_namespaces_and_end_sites_are_understood(source):
     names = tuple(f"mixamorig:{name}" for name in source.names)
-    assert retarget._joints(source._replace(names=names), "walk") == retarget._joints(source, "walk")
+    assert retarget.joints(source._replace(names=names), "walk") == retarget.joints(source, "walk")
     names = tuple(name.replace("LeftToe", "LeftFoot end") for name in source.names)
-    assert retarget._joints(source._replace(names=names), "walk") == retarget._joints(source, "walk")
+    assert retarget.joints(source._replace(names=names), "walk") == retarget.joints(source, "walk")
 
 
 def test_command(robot, second, tmp_path, capsys):

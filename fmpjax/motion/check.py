@@ -1,6 +1,7 @@
 """Whether a clip is fit to learn from: figures with healthy ranges, and a verdict for each."""
 
 import copy
+import dataclasses
 from typing import NamedTuple
 
 import mujoco
@@ -16,6 +17,13 @@ from fmpjax.robots import Robot
 CONTACT = 0.01  # m, a sole point below this height counts as standing
 BEARING = 0.03  # m, a sole point at this height bears nothing, one on the floor its share
 DAMPING = 1e-3  # keeps forces finite where few points are near the floor
+PIECE, LEAST_PIECE = 5000, 10  # samples that are checked at once, for memory, and that are worth it
+MOST_PACE = 60.0  # s in which strides are looked for
+WAY = 0.5  # m; a root that ends nearer to its start has no way
+TURNED, HEADED = np.radians(45), np.radians(20)  # from where a motion turns, or heads off +x
+CLOSED = 0.3  # rad between the last pose and the first of a motion that loops
+STEADY = 0.9  # correlation of a gait with itself a stride later
+SLOW, FAST = 0.55, 1.8  # of the speed that strides suggest: walks and runs at their own rate are within
 SMOOTHING = 0.07  # s, half of the window over which accelerations are fitted for the torques
 
 
@@ -36,6 +44,9 @@ RANGES = {
     "joint acceleration": Range("rad/s²", 0.0, 600.0, 2500.0),
     "root acceleration": Range("m/s²", 0.0, 40.0, 200.0),
     "root turn": Range("rad/s", 0.0, 10.0, 30.0),
+    "tilt": Range("deg", 0.0, 45.0, 120.0),
+    "heading": Range("deg", -np.inf, np.inf),
+    "turning": Range("rad/s", -np.inf, np.inf),
     "flips": Range("", 0, 0),
     "foot slip": Range("m/s", 0.0, 0.3, 1.0),
     "penetration": Range("m", 0.0, 0.02, 0.08),
@@ -43,6 +54,9 @@ RANGES = {
     "torque": Range("of the limit", 0.0, 1.25, 4.0),
     "loop gap": Range("rad", 0.0, np.inf),
 }
+
+
+_VERDICTS = ("good", "odd", "broken")
 
 
 class Figure(NamedTuple):
@@ -61,18 +75,20 @@ class Figure(NamedTuple):
         return "good" if span.low <= self.value <= span.high else "odd"
 
 
-def check(robot: Robot, clip: MotionClip, flips: int = 0) -> list[Figure]:
-    """The figures of a clip, in the order of `RANGES`.
+def check(robot: Robot, clip: MotionClip, flips: int = 0, start: float = 0.0) -> list[Figure]:
+    """The figures of a clip that begins at ``start`` s, in the order of `RANGES`.
 
     ``duration``; ``speed``, the root's mean over the floor; ``limit excess`` of a joint beyond its limit; greatest
     ``joint speed`` and, from second differences, ``joint acceleration``, ``root acceleration``; ``root turn``, its
-    greatest angular velocity; ``flips`` of the root quaternion's sign in the file; ``foot slip``, the mean speed over
+    greatest angular velocity; ``tilt`` of the root from upright, exceeded half of the time; ``heading`` of its way from
+    start to end, from +x to the left, or of its x axis where it stays; ``turning``, mean rate of its heading to the
+    left; ``flips`` of the root quaternion's sign in the file; ``foot slip``, the mean speed over
     the floor of sole points below `CONTACT`; ``penetration``, greatest; ``float``, the height of the lowest sole point
     that is undercut a tenth of the time; ``torque``, the greatest share of a motor's limit, exceeded 1 % of the time;
     ``loop gap``, the greatest angle between the last pose and the first.
     """
     joints, rate = clip.qpos[:, 7:], clip.rate
-    names, times = robot.joint_names, np.arange(len(clip)) / rate
+    names, times = robot.joint_names, start + np.arange(len(clip)) / rate
     points, rotation = sole_points(robot, clip.qpos)
     height = points[..., 2] - robot.sole_radius
     lowest = height.min(axis=1)
@@ -82,6 +98,8 @@ def check(robot: Robot, clip: MotionClip, flips: int = 0) -> list[Figure]:
     greatest = np.percentile(share.max(axis=1), 99)
     target, last = loop_target(clip), clip.qpos[-1]
     tilt = np.linalg.norm(rotations.log_map(rotations.multiply(rotations.conjugate(last[3:7]), target[3:7])))
+
+    facing = float(np.degrees(rotations.yaw(np.asarray(clip.qpos[0, 3:7]))))
 
     def worst(name: str, values: np.ndarray, first: int = 0) -> Figure:
         row, column = np.unravel_index(np.argmax(values), values.shape)
@@ -98,12 +116,118 @@ def check(robot: Robot, clip: MotionClip, flips: int = 0) -> list[Figure]:
         worst("joint acceleration", np.abs(np.diff(joints, 2, axis=0)) * rate**2, 1),
         worst("root acceleration", np.linalg.norm(np.diff(clip.qpos[:, :3], 2, axis=0), axis=1)[:, None] * rate**2, 1),
         worst("root turn", np.linalg.norm(clip.qvel[:, 3:6], axis=1)[:, None]),
+        Figure("tilt", float(np.degrees(np.median(np.arccos(np.clip(rotations.up(clip.qpos[:, 3:7]), -1, 1)))))),
+        Figure("heading", float(np.degrees(heading(clip))), f"faces {facing:.0f}°"),
+        Figure("turning", turning(clip), f"{np.degrees(spread(clip)):.0f}° at most from the first heading"),
         Figure("flips", flips, "taken out on reading" if flips else ""),
         Figure("foot slip", float(slide.mean()) if len(slide) else 0.0, "" if len(slide) else "nothing stands"),
         worst("penetration", np.maximum(0.0, -lowest)[:, None]),
         Figure("float", float(max(0.0, np.percentile(lowest, 10)))),
         Figure("torque", float(greatest), names[int(np.argmax(np.percentile(share, 99, axis=0)))]),
         Figure("loop gap", float(max(tilt, np.abs(last[7:] - target[7:]).max()))),
+    ]
+
+
+def heading(clip: MotionClip) -> float:
+    """Direction (rad from +x) of the root's way from start to end, or of its first x axis where the way is short."""
+    way = clip.qpos[-1, :2] - clip.qpos[0, :2]
+    return float(np.arctan2(way[1], way[0]) if np.linalg.norm(way) > WAY else rotations.yaw(clip.qpos[0, 3:7]))
+
+
+def turning(clip: MotionClip) -> float:
+    """Mean rate (rad/s) at which the root's heading turns to the left."""
+    yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
+    return float((yaw[-1] - yaw[0]) / clip.duration)
+
+
+def spread(clip: MotionClip) -> float:
+    """Greatest angle (rad) of the root's heading from that of the first sample."""
+    yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
+    return float(np.abs(yaw - yaw[0]).max())
+
+
+def unsuited(robot: Robot, clip: MotionClip, *, axes: str, reset: str, seconds: float) -> list[str]:
+    """Sentences on what does not fit the settings of a run, each with what helps.
+
+    Args:
+      axes: ``features.axes``, "world" or "heading".
+      reset: ``env.reset``, "dataset" or "fixed".
+      seconds: length of an evaluation's episode, s.
+    """
+    said = []
+    turned, rate, ahead = spread(clip), turning(clip), heading(clip)
+    if axes == "world" and turned > TURNED:
+        said.append(
+            f"the heading turns by {np.degrees(turned):.0f}° ({rate:.2f} rad/s on average), and windows are in the "
+            "world's axes: --set features.axes=heading learns turns"
+        )
+    elif axes == "world" and reset == "fixed" and abs(ahead) > HEADED:
+        said.append(
+            f"the motion heads {np.degrees(ahead):.0f}° from +x, and episodes start in the fixed pose, which looks "
+            "along +x: `fmpjax motion import --heading 0` turns the motion"
+        )
+    last, target = clip.qpos[-1], loop_target(clip)
+    if clip.duration < seconds and np.abs(last[7:] - target[7:]).max() > CLOSED:
+        said.append(
+            f"the motion lasts {clip.duration:.1f} s and does not loop, and an evaluation lasts {seconds:g} s: "
+            "what the policy does after the motion's end is its own"
+        )
+    if _assumed_rate(clip):
+        ratio, stride = pace(robot, clip)
+        if not SLOW < ratio < FAST:
+            said.append(
+                f"strides of {stride:.2f} m are usually made {'faster' if ratio < 1 else 'slower'}, and the file names "
+                "no rate: is its rate another one (--fps)?"
+            )
+    return said
+
+
+def _assumed_rate(clip: MotionClip) -> bool:
+    return any(fact.what == "rate" and fact.why.startswith("assumed") for fact in clip.reading.facts)
+
+
+def pace(robot: Robot, clip: MotionClip) -> tuple[float, float]:
+    """The speed in relation to what legs of such a length do with such strides, and a stride (m); (1, 0) if unknown.
+
+    Animals of all sizes make strides of 2.3 hip heights times the Froude number to the power 0.3 (Alexander 1976).
+    Lengths do not depend on a file's rate, so a wrong rate shows.
+    """
+    left, right = robot.sagittal_joints[0], robot.sagittal_joints[3]
+    rows = slice(0, int(MOST_PACE * clip.rate))
+    swing = clip.qpos[rows, 7 + left] - clip.qpos[rows, 7 + right]
+    swing = swing - swing.mean()
+    lags = np.arange(int(0.3 * clip.rate), min(int(3 * clip.rate), len(swing) * 2 // 3))
+    if len(lags) < 3 or swing.std() < 0.1:
+        return 1.0, 0.0
+    alike = np.array([np.corrcoef(swing[:-lag], swing[lag:])[0, 1] for lag in lags])
+    peaks = np.flatnonzero((alike[1:-1] >= alike[:-2]) & (alike[1:-1] >= alike[2:]) & (alike[1:-1] > STEADY)) + 1
+    if not len(peaks):
+        return 1.0, 0.0
+    speed = np.linalg.norm(np.diff(clip.qpos[rows, :2], axis=0), axis=1).mean() * clip.rate
+    hip, stride = robot.default_qpos[2], speed * lags[peaks[0]] / clip.rate
+    if stride < 0.5 * hip:
+        return 1.0, 0.0
+    return speed / (np.sqrt(9.81 * hip) * (stride / (2.3 * hip)) ** (1 / 0.6)), stride
+
+
+def faults(robot: Robot, clip: MotionClip) -> list[str]:
+    """A sentence per figure that is not good, broken ones first; a long clip is checked in pieces."""
+    worst: dict[str, Figure] = {}
+    for first in range(0, max(1, len(clip) - 1), PIECE - 1):
+        rows = slice(first, first + PIECE)
+        piece = clip if len(clip) <= PIECE else dataclasses.replace(clip, qpos=clip.qpos[rows], qvel=clip.qvel[rows])
+        if len(piece) < LEAST_PIECE < len(clip):
+            continue
+        for figure in check(robot, piece, start=first / clip.rate):
+            known = worst.setdefault(figure.name, figure)
+            if (_VERDICTS.index(figure.verdict), figure.value) > (_VERDICTS.index(known.verdict), known.value):
+                worst[figure.name] = figure
+    worst["duration"] = Figure("duration", clip.duration)
+    figures = sorted(worst.values(), key=lambda figure: -_VERDICTS.index(figure.verdict))
+    return [
+        f"{f.name} is {f.verdict}: {_value(f)}, healthy {_healthy(f)}{f' ({f.where})' if f.where else ''}"
+        for f in figures
+        if f.verdict != "good"
     ]
 
 
@@ -143,12 +267,22 @@ def torques(robot: Robot, clip: MotionClip, points: np.ndarray, height: np.ndarr
     return np.abs(needed[:, 6:] - (np.swapaxes(jacobian[:, :, 6:], 1, 2) @ force)[..., 0])
 
 
+def _value(figure: Figure) -> str:
+    return f"{figure.value:.3g} {RANGES[figure.name].unit}"
+
+
+def _healthy(figure: Figure) -> str:
+    span = RANGES[figure.name]
+    if not np.isfinite(span.low):
+        return "any"
+    return f"{span.low:g} to {span.high:g}" if np.isfinite(span.high) else f"from {span.low:g}"
+
+
 def table(figures: list[Figure]) -> str:
     """The figures as lines of text: value, healthy range, verdict."""
     lines = []
     for figure in figures:
-        span = RANGES[figure.name]
-        healthy = f"{span.low:g} to {span.high:g}" if np.isfinite(span.high) else f"from {span.low:g}"
-        value = f"{figure.value:.3g} {span.unit}"
-        lines.append(f"{figure.name:<19}{value:<20}{healthy:<12}{figure.verdict:<8}{figure.where}".rstrip())
+        lines.append(
+            f"{figure.name:<19}{_value(figure):<20}{_healthy(figure):<12}{figure.verdict:<8}{figure.where}".rstrip()
+        )
     return "\n".join([f"{'figure':<19}{'value':<20}{'healthy':<12}verdict", *lines])

@@ -2,10 +2,31 @@
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from fmpjax import rotations
+
+
+class Fact(NamedTuple):
+    """One thing that a file was read as, and where that comes from."""
+
+    what: str
+    value: str
+    why: str
+
+
+class Reading(NamedTuple):
+    """What a file was read as: format, robot, joints, quaternion order, rate; and what could not be proved."""
+
+    facts: tuple[Fact, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        """One line per fact, then one per warning."""
+        lines = [f"  {fact.what:<12}{fact.value:<32}{fact.why}".rstrip() for fact in self.facts]
+        return "\n".join([*lines, *(f"  warning: {warning}" for warning in self.warnings)])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -22,6 +43,7 @@ class MotionClip:
     rate: float  # Hz
     qpos: np.ndarray
     qvel: np.ndarray
+    reading: Reading = Reading()  # empty for a clip that comes from no file
 
     def __len__(self) -> int:
         return len(self.qpos)

@@ -1,10 +1,13 @@
 """Clips made from a clip: its mirror image, turned to a heading, closed to a loop, put right."""
 
+import dataclasses
+from collections.abc import Sequence
+
 import numpy as np
 
 from fmpjax import rotations
 from fmpjax.errors import UserError
-from fmpjax.motion.clip import MotionClip
+from fmpjax.motion.clip import MotionClip, resample
 from fmpjax.motion.soles import sole_points
 from fmpjax.robots import Robot
 
@@ -78,6 +81,57 @@ def looped(clip: MotionClip) -> MotionClip:
     return _with(clip, qpos)
 
 
+def repeated(clip: MotionClip, times: int) -> MotionClip:
+    """The clip ``times`` times on end, each copy where the one before has ended, after its ends are made to meet."""
+    closed, turn = looped(clip).qpos, np.array([1.0, 0.0, 0.0, 0.0])
+    pieces, place = [closed[:1]], closed[0, :3]
+    step = closed[1:] - np.concatenate([closed[0, :3], np.zeros(clip.qpos.shape[1] - 3)])
+    turned = rotations.yaw(closed[-1, 3:7]) - rotations.yaw(closed[0, 3:7])
+    about = rotations.exp_map(np.array([0.0, 0.0, turned]))
+    for _ in range(times):
+        piece = step.copy()
+        piece[:, :3] = place + rotations.rotate(turn, step[:, :3])
+        piece[:, 3:7] = rotations.multiply(turn, step[:, 3:7])
+        pieces.append(piece)
+        place, turn = piece[-1, :3], rotations.multiply(turn, about)
+    return _with(clip, np.concatenate(pieces))
+
+
+def faster(clip: MotionClip, factor: float) -> MotionClip:
+    """The clip played ``factor`` times as fast, at the same rate.
+
+    Raises:
+      UserError: the factor is not between a quarter and four, or fewer than two samples are left.
+    """
+    if not 0.25 <= factor <= 4:
+        raise UserError(f"--speed is {factor:g}: expected a factor from 0.25 to 4")
+    qpos = resample(clip.qpos, clip.rate * factor, clip.rate)
+    if len(qpos) < 2:
+        raise UserError(f"motion {clip.name!r} has {len(qpos)} sample at {factor:g} times its speed: expected two")
+    return _with(clip, qpos)
+
+
+def joined(clips: Sequence[MotionClip]) -> MotionClip:
+    """Clips of one rate on end: each begins where the one before has ended, heading there, bent over `BLEND` s to meet.
+
+    The meeting pose is the earlier clip's last one; the later clip's first `BLEND` s go over to its own poses.
+    """
+    pieces = [clips[0].qpos]
+    for clip in clips[1:]:
+        last, qpos = pieces[-1][-1], clip.qpos.copy()
+        turn = rotations.exp_map(np.array([0.0, 0.0, rotations.yaw(last[3:7]) - rotations.yaw(qpos[0, 3:7])]))
+        qpos[:, :3] = rotations.rotate(turn, qpos[:, :3] - qpos[0, :3] * [1, 1, 0]) + last[:3] * [1, 1, 0]
+        qpos[:, 3:7] = rotations.multiply(turn, qpos[:, 3:7])
+        share = np.clip(1 - np.arange(len(clip)) / clip.rate / min(BLEND, clip.duration), 0, 1)[:, None]
+        share = share * share * (3 - 2 * share)
+        gap = rotations.log_map(rotations.multiply(rotations.conjugate(qpos[0, 3:7]), last[3:7]))
+        turned = rotations.multiply(qpos[:, 3:7], rotations.exp_map(share * gap))
+        qpos += share * (last - qpos[0])
+        qpos[:, 3:7] = turned
+        pieces.append(qpos[1:])
+    return _with(clips[0], np.concatenate(pieces))
+
+
 def fixed(robot: Robot, clip: MotionClip) -> tuple[MotionClip, list[str]]:
     """The clip within the joints' limits and with its soles on the floor, and sentences that say what was changed."""
     said, qpos = [], clip.qpos.copy()
@@ -95,4 +149,5 @@ def fixed(robot: Robot, clip: MotionClip) -> tuple[MotionClip, list[str]]:
 
 
 def _with(clip: MotionClip, qpos: np.ndarray) -> MotionClip:
-    return MotionClip.from_qpos(clip.name, clip.robot, clip.rate, qpos)
+    made = MotionClip.from_qpos(clip.name, clip.robot, clip.rate, qpos)
+    return dataclasses.replace(made, reading=clip.reading)

@@ -4,6 +4,7 @@
 or of an argument raises `UserError` with one sentence.
 """
 
+import dataclasses
 import math
 import os
 import tempfile
@@ -13,10 +14,11 @@ import numpy as np
 
 from fmpjax import resources, robots
 from fmpjax.errors import UserError
-from fmpjax.motion import readers
-from fmpjax.motion.clip import MotionClip, resample, sample_count
-from fmpjax.motion.readers.recording import MOST_SAMPLES, Recording
+from fmpjax.motion import edit, readers
+from fmpjax.motion.clip import Fact, MotionClip, resample, sample_count
+from fmpjax.motion.readers.recording import MOST_SAMPLES, ORDERS, Options, Recording, plain_name
 
+LOOPED = 10.0  # s, an evaluation's episode: a clip that loops is repeated until it lasts so long
 LEAST_SAMPLES = 11  # one window of the motion prior: ten past frames and the present one
 
 
@@ -32,22 +34,33 @@ def load(
     frames: tuple[int, int] | str | None = None,
     rate: float = 50.0,
     robot: str = "unitree_g1",
+    quaternion: str | None = None,
+    without: str = "",
+    degrees: bool = False,
 ) -> MotionClip:
-    """Load a motion and put it on the grid of ``rate``.
+    """Load a motion and put it on the grid of ``rate``; the clip's `reading` says what the file was read as.
+
+    A file that says that it loops is repeated until it lasts `LOOPED` s, unless ``frames`` takes a part of it.
 
     Args:
       path: a file of any format of `fmpjax.motion.readers`, or the name of a bundled motion such as ``"walk"``,
         which is each robot's own.
       fps: rate of the source rows, Hz; replaces the file's own.
-      frames: source rows to use, 0-based, both ends included: ``(2370, 2580)`` or ``"2370:2580"``.
+      frames: source rows to use, 0-based, both ends included: ``(2370, 2580)``, ``"2370:2580"``, ``"100:"``.
       rate: rate of the clip, Hz.
       robot: name of the robot that the file must be for.
+      quaternion: order of the root's quaternion, ``"wxyz"`` or ``"xyzw"``; replaces the format's.
+      without: words with commas between them; joints that have one in their name are not in the file and are zero.
+      degrees: the file's joints are in degrees.
 
     Raises:
       UserError: a file or an argument is bad.
     """
     _check_rate("rate", rate)
-    file, (qpos, source_rate) = record(path, fps=fps, frames=frames, robot=robot)
+    file, recording = record(
+        path, fps=fps, frames=frames, robot=robot, quaternion=quaternion, without=without, degrees=degrees
+    )
+    qpos, source_rate, reading = recording.qpos, recording.rate, recording.reading
     count = sample_count(len(qpos), source_rate, rate)
     if min(count, len(qpos)) < LEAST_SAMPLES:
         raise UserError(
@@ -59,7 +72,13 @@ def load(
             f"{file}: {len(qpos)} frames at {source_rate:g} Hz give {count} samples at {rate:g} Hz, "
             f"expected at most {MOST_SAMPLES}"
         )
-    return MotionClip.from_qpos(file.stem, robot, rate, resample(qpos, source_rate, rate))
+    clip = MotionClip.from_qpos(file.stem, robot, rate, resample(qpos, source_rate, rate))
+    if recording.loops and frames is None and clip.duration < LOOPED:
+        times = math.ceil(LOOPED / clip.duration)
+        clip = edit.repeated(clip, times)
+        fact = Fact("loop", f"{times} times", "the file says that it loops")
+        reading = reading._replace(facts=(*reading.facts, fact))
+    return dataclasses.replace(clip, reading=reading)
 
 
 def record(
@@ -68,13 +87,28 @@ def record(
     fps: float | None = None,
     frames: tuple[int, int] | str | None = None,
     robot: str = "unitree_g1",
+    quaternion: str | None = None,
+    without: str = "",
+    degrees: bool = False,
 ) -> tuple[Path, Recording]:
     """The file of a motion and its rows as they are, at their own rate; arguments and errors as of `load`."""
     _check_rate("fps", fps)
+    if quaternion not in (None, *ORDERS):
+        raise UserError(f"quaternion is {quaternion!r}, expected one of {', '.join(ORDERS)}")
     loaded = robots.load(robot)
+    words = tuple(word.strip() for word in without.split(",") if word.strip())
+    for word in words:
+        if not any(plain_name(word) in plain_name(name) for name in loaded.joint_names):
+            raise UserError(f"without is {without!r}, and no joint of robot {robot!r} has {word!r} in its name")
     file = locate(path, robot)
-    qpos, rate = readers.read(file, loaded)
-    return file, Recording(cut(file, qpos, frames), rate if fps is None else float(fps))
+    recording = readers.read(file, loaded, Options(fps, quaternion, words, degrees))
+    rows = cut(file, recording.qpos, frames)
+    if len(rows) == len(recording.qpos):
+        return file, recording
+    first, last = span(frames, len(recording.qpos))
+    fact = Fact("rows", f"{first} to {last} of {len(recording.qpos)}", "--frames")
+    reading = recording.reading._replace(facts=(*recording.reading.facts, fact))
+    return file, recording._replace(qpos=rows, reading=reading)
 
 
 def cut(file: Path, rows: np.ndarray, frames: tuple[int, int] | str | None) -> np.ndarray:
@@ -83,13 +117,36 @@ def cut(file: Path, rows: np.ndarray, frames: tuple[int, int] | str | None) -> n
     Raises:
       UserError: the frames are not two row numbers of the file, in order.
     """
-    span = _parse_frames(frames)
-    if span is None:
+    if frames is None:
         return rows
-    first, last = span
+    first, last = span(frames, len(rows))
     if last >= len(rows):
         raise UserError(f"{file}: frames {first}:{last} are outside the file, which has rows 0:{len(rows) - 1}")
     return rows[first : last + 1]
+
+
+def span(frames: tuple[int, int] | str, count: int) -> tuple[int, int]:
+    """First and last row of ``frames`` in a file of ``count`` rows; a side that is left out is the file's end.
+
+    Raises:
+      UserError: they are not two row numbers in order.
+    """
+    try:
+        if isinstance(frames, str):
+            first, last = frames.split(":")
+            if not first.strip() + last.strip():
+                raise ValueError
+            first, last = first.strip() or 0, last.strip() or max(count - 1, int(first or 0))
+        else:
+            first, last = frames
+            if first != int(first) or last != int(last):
+                raise ValueError
+        first, last = int(first), int(last)
+    except (TypeError, ValueError):
+        raise UserError(f"frames is {frames!r}, expected FIRST:LAST, such as 2370:2580, 100: or :200") from None
+    if not 0 <= first <= last:
+        raise UserError(f"frames is {first}:{last}, expected 0 <= FIRST <= LAST (rows are 0-based, both ends included)")
+    return first, last
 
 
 def save(clip: MotionClip, path: str | os.PathLike) -> Path:
@@ -133,18 +190,3 @@ def locate(path: str | os.PathLike, robot: str = "unitree_g1") -> Path:
 def _check_rate(name: str, value: float | None) -> None:
     if value is not None and not (math.isfinite(value) and value > 0):
         raise UserError(f"{name} is {value}, expected a positive number of Hz")
-
-
-def _parse_frames(frames: tuple[int, int] | str | None) -> tuple[int, int] | None:
-    if frames is None:
-        return None
-    try:
-        first, last = frames.split(":") if isinstance(frames, str) else frames
-        if not isinstance(frames, str) and (first != int(first) or last != int(last)):
-            raise ValueError
-        first, last = int(first), int(last)
-    except (TypeError, ValueError):
-        raise UserError(f"frames is {frames!r}, expected FIRST:LAST, such as 2370:2580") from None
-    if not 0 <= first <= last:
-        raise UserError(f"frames is {first}:{last}, expected 0 <= FIRST <= LAST (rows are 0-based, both ends included)")
-    return first, last

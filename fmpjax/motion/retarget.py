@@ -1,17 +1,22 @@
-"""A human's motion on a robot: BVH motion capture (LaFAN1's and CMU's skeletons) by inverse kinematics.
+"""A human's motion on a robot: BVH motion capture by inverse kinematics.
 
 The skeleton is scaled to the robot's legs. Trunk, thighs and arms point as the human's do; a limb has the robot's own
 length. A foot that stands in the source stands in the result: its sole lies on the floor and rolls over heel or toe
-without sliding. The source is taken to walk on one level floor, y up.
+without sliding. The source is taken to walk on one level floor.
+
+What is measured over the motion (its floor, the axes of its joints, its size) is measured over the whole file, so a
+part of it is the same whichever frame is the first.
 
 Landmarks are the parts of the body that a robot names in ``robot.toml``. Poses are in the robot's axes: x ahead, y to
 the left, z up. `fmpjax motion retarget` is the
 command.
 """
 
+import dataclasses
 import itertools
 import math
 import os
+import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,26 +26,36 @@ from scipy.ndimage import distance_transform_edt, median_filter, uniform_filter1
 
 from fmpjax import rotations
 from fmpjax.errors import UserError
-from fmpjax.motion import bvh
+from fmpjax.motion import bvh, check
 from fmpjax.motion.bvh import Bvh
-from fmpjax.motion.clip import MotionClip
-from fmpjax.motion.formats import cut, save
+from fmpjax.motion.clip import Fact, MotionClip, Reading
+from fmpjax.motion.formats import cut, save, span
 from fmpjax.robots import Robot
 
 SIDES = ("left", "right")
-# What LaFAN1 and CMU call a limb's joint, after Left or l, Right or r; where a skeleton has several, the first counts.
+# What skeletons call a limb's joint, beside left or l, right or r; where a skeleton has several, the first counts.
+# LaFAN1 and Mixamo (UpLeg), CMU (femur), Xsens and 100STYLE (Hip, Knee, Ankle, Shoulder), Blender and Unreal (thigh).
 JOINT_NAMES = {
-    "hip": ("UpLeg", "femur"),
-    "knee": ("Leg", "tibia"),
-    "ankle": ("Foot",),
-    "toe": ("Toe", "ToeBase", "toes", "Foot end"),
-    "shoulder": ("Arm", "humerus"),
-    "elbow": ("ForeArm", "radius"),
+    "hip": ("UpLeg", "femur", "UpperLeg", "thigh", "Hip"),
+    "knee": ("Leg", "tibia", "LowerLeg", "LowLeg", "calf", "shin", "Knee"),
+    "ankle": ("Ankle", "Foot"),
+    "toe": ("Toe", "ToeBase", "toes", "ball", "Foot end", "Ankle end", "Foot"),
+    "shoulder": ("Arm", "humerus", "UpperArm", "UpArm", "Shoulder"),
+    "elbow": ("ForeArm", "radius", "LowerArm", "LowArm", "Elbow"),
     "wrist": ("wrist", "Hand"),
 }
+# Which of the file's axes are ahead, left and up, by the one that is up. Heading is free, so "ahead" is any of two.
+AXES = {"y": (2, 0, 1), "z": (0, 1, 2)}
+UPRIGHT = 0.5  # share of the way from ankles to hips that is along the axis that is up, in most frames
+ODD_FIRST, ODD_SPEED = (
+    5.0,
+    15.0,
+)  # times the frames after it, and rad/s: a first frame that turns so much is another pose
+NEXT = 20  # frames after the first that it is compared with
 MOST_RATE = 60.0  # Hz; of a faster source every second, third, ... frame is used
 
 MOST_REACH = 1e5  # m
+MOST_SKELETON = 1 << 16  # bytes
 
 # Of a heel or toe that stands, at the robot's size.
 CONTACT_HEIGHT = 0.03  # m, above where it usually stands
@@ -55,12 +70,16 @@ WEIGHTS = {
     "pelvis": (1.0, 0.5),
     "chest": (0.0, 0.5),
     "knee": (0.2, 0.0),
-    "ankle": (10.0, 3.0),
+    # Feet of humans tilt further than the robot's ankles: their place counts, their orientation gives way.
+    "ankle": (10.0, 0.3),
     "elbow": (0.5, 0.0),
     "wrist": (0.5, 0.0),
 }
 POSTURE_WEIGHT = 0.01  # 1/rad, toward the default pose: decides what the targets leave open
-DAMPING = 1e-4
+# Steps are damped, or near stretched knees and joint limits the solver jumps from one branch to another.
+DAMPING = 1e-2
+# Of a frame's landmarks from their targets, m: doubtful and broken, on average over the motion and at worst.
+MEAN_RESIDUAL, WORST_RESIDUAL = (0.04, 0.10), (0.12, 0.30)
 FIRST_ITERATIONS, ITERATIONS = 100, 2
 SMALL_STEP = 1e-3  # rad and m; a frame that moves less is solved
 
@@ -81,18 +100,44 @@ class Retargeted(NamedTuple):
     contact: np.ndarray  # [T, 2] bool, left and right foot stand in the source
     scale: float  # m of the robot per unit of the file
 
+    def verdict(self, robot: Robot) -> tuple[str, list[str]]:
+        """``good``, ``odd`` or ``broken``, and a sentence per fault: of the fit, and of the clip by `check`."""
+        fit = []
+        for name, value, (odd, broken) in (
+            ("mean residual", float(self.residual.mean()), MEAN_RESIDUAL),
+            ("worst residual", float(self.residual.max()), WORST_RESIDUAL),
+        ):
+            if not value < odd:
+                at = f" (at {np.argmax(self.residual) / self.clip.rate:.2f} s)" if name.startswith("worst") else ""
+                what = "odd" if value < broken else "broken"
+                fit.append(f"{name} is {what}: {1000 * value:.0f} mm, healthy to {1000 * odd:.0f} mm{at}")
+        faults = fit + check.faults(robot, self.clip)
+        broken = any(" is broken: " in fault for fault in faults)
+        return "broken" if broken else "odd" if faults else "good", faults
 
-def retarget(source: Bvh, robot: Robot, name: str) -> Retargeted:
+
+def retarget(
+    source: Bvh,
+    robot: Robot,
+    name: str,
+    *,
+    span: tuple[int, int] | None = None,
+    skeleton: dict[str, str] | None = None,
+    up: str | None = None,
+) -> Retargeted:
     """The motion of ``source`` on ``robot``, at the source's rate or the largest part of it up to `MOST_RATE`.
 
     Args:
-      source: a skeleton with the names of LaFAN1 or CMU.
+      source: a skeleton whose joints `JOINT_NAMES` or ``skeleton`` know.
       robot: a robot with landmarks.
       name: of the clip, and of the source in errors.
+      span: first and last frame to retarget, both included; all by default.
+      skeleton: the skeleton's joint of parts such as "left_hip", where its name is not known.
+      up: the file's axis that is up, "y" or "z"; by default the one along which hips are over ankles.
 
     Raises:
-      UserError: the skeleton lacks a joint or a limb has no length, the motion is too short or goes too far, the robot
-        lacks a landmark, or mink is not installed.
+      UserError: the skeleton lacks a joint or a limb has no length, which axis is up is not clear, the motion is too
+        short or goes too far, the robot lacks a landmark, or mink is not installed.
     """
     needed = ["pelvis", "chest", *(f"{side}_{part}" for side in SIDES for part in JOINT_NAMES if part != "toe")]
     missing = [part for part in needed if part not in robot.landmarks]
@@ -100,16 +145,21 @@ def retarget(source: Bvh, robot: Robot, name: str) -> Retargeted:
         raise UserError(
             f"robot {robot.name!r} has no landmark {missing[0]!r} in its robot.toml, which retargeting needs"
         )
-    every = max(1, math.ceil(source.rate / MOST_RATE - 1e-6))
+    first, last = (0, len(source.values) - 1) if span is None else span
+    every = max(1, math.ceil(source.rate / MOST_RATE - 1e-3))
     rate = source.rate / every
-    values = source.values[::every]
-    if len(values) < 2:
-        raise UserError(f"{name}: the motion has {len(values)} frame at {rate:g} Hz, expected at least two")
-    joint = _joints(source, name)
+    # Before the span as well as after it: every frame of the file that falls on the grid of its first frame.
+    values = source.values[first % every :: every]
+    chosen = slice(first // every, first // every + (last - first) // every + 1)
+    count = len(values[chosen])
+    if count < 2:
+        raise UserError(f"{name}: the motion has {count} frame at {rate:g} Hz, expected at least two")
+    joint = joints(source, name, skeleton)
     poses = bvh.joint_poses(source._replace(values=values))
-    # From x to the left, y up, z ahead.
-    position = {part: poses.position[:, j][:, [2, 0, 1]] for part, j in joint.items()}
-    rotation_wxyz = {part: poses.rotation_wxyz[:, j][:, [0, 3, 1, 2]] for part, j in joint.items()}
+    told, up = up, up or _up(poses.position, joint, name)
+    axes = list(AXES[up])
+    position = {part: poses.position[:, j][:, axes] for part, j in joint.items()}
+    rotation_wxyz = {part: poses.rotation_wxyz[:, j][:, [0, *(1 + a for a in axes)]] for part, j in joint.items()}
     for a, b in _segments():
         if not np.linalg.norm(position[a] - position[b], axis=-1).min() > 0:
             raise UserError(f"{name}: the skeleton's {a} and {b} are at one place, expected a distance")
@@ -121,44 +171,174 @@ def retarget(source: Bvh, robot: Robot, name: str) -> Retargeted:
             f"{name}: the motion is {reach:.3g} m away at the robot's size, expected less than {MOST_REACH:g}"
         )
     targets = _targets(robot, rest, {part: scale * p for part, p in position.items()}, rotation_wxyz, rate)
+    targets = Targets(
+        {part: values[chosen] for part, values in targets.position.items()},
+        {part: values[chosen] for part, values in targets.rotation_wxyz.items()},
+        targets.contact[chosen],
+    )
     qpos, residual = _solve(robot, targets, rate)
-    return Retargeted(MotionClip.from_qpos(name, robot.name, rate, qpos), residual, targets.contact, scale)
+    known = ", ".join(f"{part} {source.names[joint[part]]}" for part in joint if part.startswith(("left", "pel", "ch")))
+    thinned = f", one frame of {every}" if every > 1 else ""
+    reading = Reading(
+        (
+            Fact("format", "BVH", f"{len(source.names)} joints, {len(source.values)} frames"),
+            Fact("robot", robot.name, "--robot"),
+            Fact("skeleton", "--skeleton" if skeleton else "by its names", known),
+            Fact("up", up, "--up" if told else "hips are over ankles along it"),
+            Fact("size", f"{scale:.4g} m per unit", "legs as long as the robot's"),
+            Fact("rate", f"{rate:g} Hz", f"the file's {source.rate:g} Hz{thinned}"),
+        )
+    )
+    clip = MotionClip.from_qpos(name, robot.name, rate, qpos)
+    return Retargeted(dataclasses.replace(clip, reading=reading), residual, targets.contact, scale)
 
 
-def convert(file: str | os.PathLike, robot: Robot, out: str | os.PathLike, frames: str | None = None) -> str:
-    """Retarget the BVH ``file``, or its ``frames`` FIRST:LAST, and write the clip as ``out``; says how it fits.
+def odd_start(source: Bvh) -> bool:
+    """Whether the first frame is another pose, such as a T-pose, and the motion begins at the second."""
+    if len(source.values) < 4:
+        return False
+    turned = bvh.joint_poses(source._replace(values=source.values[: NEXT + 2])).rotation_wxyz
+    between = rotations.multiply(rotations.conjugate(turned[:-1]), turned[1:])
+    angle = np.linalg.norm(rotations.log_map(between), axis=-1).max(axis=1)
+    return bool(angle[0] * source.rate > ODD_SPEED and angle[0] > ODD_FIRST * angle[1:].max())
+
+
+def convert(
+    file: str | os.PathLike,
+    robot: Robot,
+    out: str | os.PathLike,
+    frames: str | None = None,
+    *,
+    skeleton: str | os.PathLike | None = None,
+    up: str | None = None,
+) -> tuple[str, bool]:
+    """Retarget the BVH ``file``, or its ``frames`` FIRST:LAST, and write the clip as ``out``.
+
+    Args:
+      skeleton: a TOML file that names the skeleton's joint of each part, such as ``left_hip = "LThigh"``.
+      up: the file's axis that is up, "y" or "z".
+
+    Returns:
+      What was read and how it fits, and whether the result is broken. A broken one is written as well.
 
     Raises:
       UserError: see `bvh.read`, `formats.cut`, `retarget` and `fmpjax.motion.save`.
     """
     file = Path(file)
+    if up not in (None, *AXES):
+        raise UserError(f"--up is {up!r}, expected one of {', '.join(AXES)}")
     source = bvh.read(file)
-    done = retarget(source._replace(values=cut(file, source.values, frames)), robot, file.stem)
+    names = None if skeleton is None else read_skeleton(skeleton)
+    count, said = len(source.values), []
+    cut(file, source.values, frames)  # refuses rows that are not there
+    first, last = (0, count - 1) if frames is None else span(frames, count)
+    if first == 0 and last > 1 and odd_start(source):
+        first = 1
+        said.append("frame 0 is another pose, and is left out")
+    done = retarget(source, robot, file.stem, span=(first, last), skeleton=names, up=up)
     save(done.clip, out)
-    return (
+    facts = [*done.clip.reading.facts, Fact("frames", f"{first} to {last}", "--frames" if frames else "all")]
+    verdict, faults = done.verdict(robot)
+    lines = [
+        f"{file} was read as",
+        str(Reading(tuple(facts), tuple(said))),
         f"wrote {out}: {len(done.clip)} frames at {done.clip.rate:g} Hz, {done.scale:.4g} m per unit of the file, "
         f"{1000 * done.residual.mean():.1f} mm off the scaled skeleton on average and "
-        f"{1000 * done.residual.max():.1f} mm at worst"
-    )
+        f"{1000 * done.residual.max():.1f} mm at worst",
+        f"verdict: {verdict}",
+        *(f"  {fault}" for fault in faults),
+    ]
+    return "\n".join(lines), verdict == "broken"
 
 
-def _joints(source: Bvh, name: str) -> dict[str, int]:
-    """Indices of the skeleton's joints by the part of the body."""
-    index = {joint.rpartition(":")[2].lower(): i for i, joint in enumerate(source.names)}
+def read_skeleton(path: str | os.PathLike) -> dict[str, str]:
+    """The skeleton's joints by the part of the body, from a TOML file of lines such as ``left_hip = "LThigh"``.
+
+    Raises:
+      UserError: the file cannot be read, or names a part that there is not.
+    """
+    file = Path(path)
+    try:
+        if file.stat().st_size > MOST_SKELETON:
+            raise UserError(f"{file}: the file has {file.stat().st_size} bytes, expected at most {MOST_SKELETON}")
+        names = tomllib.loads(file.read_text("utf-8"))
+    except OSError as error:
+        raise UserError(f"cannot read {file}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError):
+        raise UserError(f'{file}: not TOML, expected lines such as left_hip = "LThigh"') from None
+    parts = ["pelvis", "chest", *(f"{side}_{part}" for side in SIDES for part in JOINT_NAMES)]
+    for part, name in names.items():
+        if part not in parts or not isinstance(name, str):
+            raise UserError(f"{file}: {part[:40]!r} is no part with a joint's name, expected one of {', '.join(parts)}")
+    return names
+
+
+def joints(source: Bvh, name: str, skeleton: dict[str, str] | None = None) -> dict[str, int]:
+    """Indices of the skeleton's joints by the part of the body.
+
+    Raises:
+      UserError: a part has no joint whose name is known, or ``skeleton`` names a joint that there is not.
+    """
+    index = {}
+    for i, joint in enumerate(source.names):
+        index.setdefault(_plain(joint), i)
     found = {}
-    for side in SIDES:
-        for part, names in JOINT_NAMES.items():
-            known = [prefix + joint.lower() for joint in names for prefix in (side, side[0])]
-            match = [index[joint] for joint in known if joint in index]
-            if not match:
-                raise UserError(
-                    f"{name}: the skeleton has no joint for the {side} {part}, "
-                    f"expected one named {side.title()}{names[0]} as in LaFAN1 or as CMU names it"
-                )
-            found[f"{side}_{part}"] = match[0]
-    found["pelvis"] = _fork(source.parent, found["left_hip"], found["right_hip"])
-    found["chest"] = _fork(source.parent, found["left_shoulder"], found["right_shoulder"])
+    for part, joint in (skeleton or {}).items():
+        if joint not in source.names:
+            raise UserError(
+                f"{name}: the skeleton has no joint {joint[:40]!r} for {part}, expected one of {_listed(source)}"
+            )
+        found[part] = source.names.index(joint)
+    for side, (part, names) in itertools.product(SIDES, JOINT_NAMES.items()):
+        if f"{side}_{part}" in found:
+            continue
+        known = [
+            _plain(joint)
+            for other in names
+            for joint in (side + other, side[0] + other, f"{other}{side}", f"{other}{side[0]}", *_end(other, side))
+        ]
+        match = [index[joint] for joint in known if joint in index and index[joint] not in found.values()]
+        if not match:
+            raise UserError(
+                f"{name}: the skeleton has no joint for the {side} {part}, expected one named "
+                f"{side.title()}{names[0]} or the like; name it in a file for --skeleton, with lines such as "
+                f'{side}_{part} = "{source.names[-1][:40]}", from {_listed(source)}'
+            )
+        found[f"{side}_{part}"] = match[0]
+    found.setdefault("pelvis", _fork(source.parent, found["left_hip"], found["right_hip"]))
+    found.setdefault("chest", _fork(source.parent, found["left_shoulder"], found["right_shoulder"]))
     return found
+
+
+def _end(name: str, side: str) -> tuple[str, ...]:
+    """An end site's name where the side is written after the limb's."""
+    limb, end, _ = name.partition(" end")
+    return (f"{limb}{side}{end}", f"{limb}{side[0]}{end}") if end else ()
+
+
+def _plain(joint: str) -> str:
+    """A joint's name without a namespace, case and signs: mixamorig:LeftUpLeg, left_up_leg and LeftUpLeg are one."""
+    joint = joint.rpartition(":")[2].lower()
+    return "".join(c for c in joint.removeprefix("mixamorig_") if c.isalnum())
+
+
+def _listed(source: Bvh) -> str:
+    names = ", ".join(source.names)
+    return names if len(names) <= 300 else f"{names[:297]}..."
+
+
+def _up(position: np.ndarray, joint: dict[str, int], name: str) -> str:
+    """The file's axis that is up, by where the hips are seen from the ankles; ``position [T, J, 3]``."""
+    legs = sum(position[:, joint[f"{side}_hip"]] - position[:, joint[f"{side}_ankle"]] for side in SIDES)
+    legs = legs / np.maximum(np.linalg.norm(legs, axis=-1, keepdims=True), 1e-9)
+    along = {axis: float(np.median(legs[:, "xyz".index(axis)])) for axis in AXES}
+    up = max(along, key=along.get)
+    if along[up] < UPRIGHT:
+        raise UserError(
+            f"{name}: hips are over ankles neither along y nor along z in most frames, expected one of them to be up; "
+            "say which with --up y or --up z"
+        )
+    return up
 
 
 def _fork(parent: np.ndarray, a: int, b: int) -> int:
@@ -362,5 +542,7 @@ def _solve(robot: Robot, targets: Targets, rate: float) -> tuple[np.ndarray, np.
             if np.abs(step).max() < SMALL_STEP:
                 break
         qpos[t] = data.qpos
+        # The solver meets limits to its own tolerance.
+        qpos[t, 7:] = np.clip(qpos[t, 7:], robot.joint_low, robot.joint_high)
         residual[t] = np.sqrt(np.mean(np.sum((data.xpos[bodies] - wanted[t]) ** 2, axis=-1)))
     return qpos, residual

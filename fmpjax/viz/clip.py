@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from fmpjax.errors import UserError
 from fmpjax.motion.clip import MotionClip
+from fmpjax.motion.segment import KINDS, Stretch
 from fmpjax.motion.soles import sole_points
 from fmpjax.robots import Robot
 from fmpjax.viz import render
@@ -19,6 +21,7 @@ PICTURES, COLUMNS = 20, 5  # of a contact sheet
 VIDEO_FPS = 50.0  # Hz, at most
 SIDES = ("left_", "right_")
 COLOURS = ("#2a6fb0", "#c8553d", "#3a8a6b")  # left, right, neither
+KIND_COLOURS = dict(zip(KINDS, ("#b8b8b8", "#9b6fb0", "#2a6fb0", "#3a8a6b", "#c8553d"), strict=True))
 
 
 def has_display() -> bool:
@@ -90,6 +93,39 @@ def plot(robot: Robot, clip: MotionClip, path: str | Path) -> Path:
     for panel in panels[-1]:
         panel.set_xlabel("s", fontsize=9)
     figure.suptitle(f"{clip.name}: left blue, right red; dotted: limits", fontsize=10)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
+    return path
+
+
+def timeline(clip: MotionClip, found: list[Stretch], path: str | Path) -> Path:
+    """Draw the root's speed and height over time with the stretches behind them, as PNG; returns its path.
+
+    Raises:
+      UserError: the name does not end in ``.png``, or the path cannot be written.
+    """
+    path = Path(path)
+    if path.suffix != ".png":
+        raise UserError(f"cannot draw stretches as {path}: expected a name that ends in .png")
+    figure = Figure((13, 4), dpi=90, layout="constrained")
+    FigureCanvasAgg(figure)
+    speed, height = figure.subplots(2, 1, sharex=True)
+    times = np.arange(len(clip)) / clip.rate
+    for panel, title, values in (
+        (speed, "speed, m/s", np.linalg.norm(clip.qvel[:, :2], axis=1)),
+        (height, "root height, m", clip.qpos[:, 2]),
+    ):
+        panel.set_ylabel(title, fontsize=9)
+        panel.plot(times, values, color="black", linewidth=0.8)
+        for stretch in found:
+            panel.axvspan(times[stretch.rows][0], times[stretch.rows][-1], color=KIND_COLOURS[stretch.kind], alpha=0.4)
+    handles = [Patch(color=colour, alpha=0.4, label=kind) for kind, colour in KIND_COLOURS.items()]
+    speed.legend(handles=handles, ncols=len(handles), fontsize=8, loc="upper right")
+    height.set_xlabel("s", fontsize=9)
+    figure.suptitle(clip.name, fontsize=10)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path)

@@ -1,21 +1,22 @@
-"""Recordings from files: one module a format, told apart by what is in the file and not by its name.
+"""Recordings from files: one module per format, told apart by what is in the file and not by its name.
 
-A file is an archive of arrays (this package's own, LocoMuJoCo's, BeyondMimic's and mjlab's), a pickle (MimicKit's,
-GMR's) or text (Unitree's CSV). A reader checks all that it uses and announces every fault as one `UserError`.
+A file is an archive of arrays, PyTorch's archive, a pickle (joblib's as well) or text. Every container may hold every
+format; a format is known by the names of its arrays. A reader checks all that it uses and announces every fault as one
+`UserError`. What a file does not prove is assumed aloud: a `Recording` has the facts it was read by.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from fmpjax.errors import UserError
-from fmpjax.motion.readers import archive, beyondmimic, gmr, lafan1, locomujoco, mimickit, own, pickled
-from fmpjax.motion.readers.recording import Recording
+from fmpjax.motion.readers import archive, bodies, gmr, humanoidverse, locomujoco, mimickit, own, pickled, text
+from fmpjax.motion.readers.recording import Options, Recording
 from fmpjax.robots import Robot
 
-ARCHIVES = (own, locomujoco, beyondmimic)
-PICKLES = (mimickit, gmr)
+FORMATS = (own, locomujoco, *bodies.DIALECTS, mimickit, gmr, humanoidverse)
 
 
-def read(file: Path, robot: Robot) -> Recording:
+def read(file: Path, robot: Robot, options: Options) -> Recording:
     """Read a motion file for ``robot``, at the file's own rate.
 
     Raises:
@@ -27,19 +28,33 @@ def read(file: Path, robot: Robot) -> Recording:
     except OSError as error:
         raise UserError(f"cannot read {file}: {error.strerror or error}") from error
     if head[:2] == b"PK":
-        return _first(file, archive.Arrays(file), ARCHIVES, robot)
-    if head[:1] in (b"\x80", b"(", b"}"):
-        return _first(file, pickled.read(file), PICKLES, robot)
+        arrays = archive.Arrays(file)
+        if any(name.endswith("/data.pkl") for name in arrays.members):
+            return _known(file, pickled.read_torch(file, arrays.members), robot, options)
+        return _known(file, arrays, robot, options)
+    if head[:1] in (b"\x80", b"(", b"}") or head[:2] in pickled.COMPRESSED:
+        return _known(file, _single(file, pickled.read(file)), robot, options)
     if head == b"HIERARCHY":
         raise UserError(f"{file}: a BVH skeleton, which `fmpjax motion retarget` puts on a robot first")
-    return lafan1.read(file, robot)
+    return text.read(file, robot, options)
 
 
-def _first(file: Path, content, formats, robot: Robot) -> Recording:
+def _single(file: Path, content: dict) -> dict:
+    """The motion in a dictionary of motions by name, where there is one; else the dictionary."""
+    motions = {name: inner for name, inner in content.items() if isinstance(inner, dict)}
+    if len(motions) != len(content) or not content:
+        return content
+    if len(motions) > 1:
+        names = ", ".join(name[:40] for name in list(motions)[:4])
+        raise UserError(f"{file}: the file holds {len(motions)} motions ({names}), expected one per file")
+    return next(iter(motions.values()))
+
+
+def _known(file: Path, content: Mapping, robot: Robot, options: Options) -> Recording:
     """The recording by the first format that knows the names in ``content``."""
-    for format_ in formats:
+    for format_ in FORMATS:
         if set(format_.MARKS) <= set(content):
-            return format_.read(file, content, robot)
+            return format_.read(file, content, robot, options)
     names = ", ".join(sorted(content)[:8]) or "nothing"
-    expected = " or ".join(f"{', '.join(f.MARKS)} ({f.NAME})" for f in formats)
+    expected = " or ".join(f"{', '.join(f.MARKS)} ({f.NAME})" for f in FORMATS)
     raise UserError(f"{file}: the file holds {names[:200]}, expected {expected}")
