@@ -1,12 +1,10 @@
-"""The commands under ``fmpjax motion``; another one is another class in `COMMANDS`."""
+"""The commands under ``fmpjax motion``; another one is another class in `MOTION`."""
 
 import dataclasses
-import functools
 import math
-import operator
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_type_hints
 
 import tyro
 
@@ -14,6 +12,7 @@ from fmpjax import motion, robots
 from fmpjax.errors import UserError
 from fmpjax.motion import MotionClip, gait
 from fmpjax.motion.gait import Style
+from fmpjax.shell import Group, default
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,9 +21,9 @@ class Source:
 
     file: tyro.conf.Positional[str]
     """A motion file of any format, or a bundled motion's name."""
-    frames: str | None = None
+    frames: Annotated[str | None, default("all")] = None
     """Source rows first:last, 0-based, both included."""
-    fps: float | None = None
+    fps: Annotated[float | None, default("the file's own")] = None
     """Rate of the source rows in place of the file's own, Hz."""
     robot: str = "unitree_g1"
     """A robot under robots/."""
@@ -48,9 +47,9 @@ class Import:
     """Motion files; several are written to the folder --out under their own names."""
     out: Path
     """File to write, .npz; a folder for several files."""
-    frames: str | None = None
+    frames: Annotated[str | None, default("all")] = None
     """Source rows first:last, 0-based, both included."""
-    fps: float | None = None
+    fps: Annotated[float | None, default("the file's own")] = None
     """Rate of the source rows in place of the file's own, Hz."""
     rate: float = 50.0
     """Rate to write, Hz."""
@@ -58,7 +57,7 @@ class Import:
     """A robot under robots/."""
     mirror: bool = False
     """Reflect left and right."""
-    heading: float | None = None
+    heading: Annotated[float | None, default("as it is")] = None
     """Turn the way from start to end to this angle from +x, deg."""
     loop: bool = False
     """Bend the last 0.4 s so that the end meets the start."""
@@ -93,7 +92,7 @@ class Check(Source):
 
     fix: bool = False
     """Put the soles on the floor, take out flips, clip joints to their limits, say what was changed, check again."""
-    out: Path | None = None
+    out: Annotated[Path | None, default("none")] = None
     """File to write the fixed motion to, .npz."""
 
     def __call__(self) -> None:
@@ -120,8 +119,8 @@ class Check(Source):
 class View(Source):
     """Show a motion in MuJoCo's viewer; without a display, or with --out, as a picture."""
 
-    out: Path | None = None
-    """A contact sheet (.png) or a video (.mp4, .gif); NAME.png where there is no display."""
+    out: Annotated[Path | None, default("the viewer, or NAME.png without a display")] = None
+    """A contact sheet (.png) or a video (.mp4, .gif)."""
 
     def __call__(self) -> None:
         from fmpjax.viz import clip as show
@@ -138,8 +137,8 @@ class View(Source):
 class Plot(Source):
     """Draw a motion's root, feet and joints over time."""
 
-    out: Path | None = None
-    """File to write, NAME-plot.png by default."""
+    out: Annotated[Path | None, default("NAME-plot.png")] = None
+    """File to write."""
 
     def __call__(self) -> None:
         from fmpjax.viz import clip as show
@@ -148,14 +147,23 @@ class Plot(Source):
         print(f"wrote {show.plot(robots.load(self.robot), clip, self.out or f'{clip.name}-plot.png')}")
 
 
+class _Style(Style):
+    """A walk's style, as the help shows what it leaves open."""
+
+    __annotations__ = {
+        name: Annotated[kind, default("the robot's own")]
+        for name, kind in get_type_hints(Style, include_extras=True).items()
+    }
+
+
 @dataclasses.dataclass(frozen=True)
 class Synthesize:
     """Write a steady walk of our own."""
 
     out: Path
     """File to write, .npz."""
-    speed: float | None = None
-    """Along the path, m/s; the robot's own by default."""
+    speed: Annotated[float | None, default("the robot's own")] = None
+    """Along the path, m/s."""
     turn: float = 0.0
     """To the left, rad/s."""
     duration: float = 8.0
@@ -164,8 +172,8 @@ class Synthesize:
     """Hz."""
     robot: str = "unitree_g1"
     """A robot under robots/."""
-    style: Style = Style()
-    """How the walk looks: lengths m, angles rad, phases as fractions of a stride; the robot's own by default."""
+    style: _Style = _Style()
+    """How the walk looks: lengths m, angles rad, phases as fractions of a stride."""
 
     def __call__(self) -> None:
         robot = robots.load(self.robot)
@@ -183,7 +191,7 @@ class Retarget:
     """Motion capture, .bvh."""
     out: Path
     """File to write, .npz."""
-    frames: str | None = None
+    frames: Annotated[str | None, default("all")] = None
     """Frames first:last of the file, 0-based, both included."""
     robot: str = "unitree_g1"
     """A robot under robots/."""
@@ -194,10 +202,9 @@ class Retarget:
         print(retarget.convert(self.file, robots.load(self.robot), self.out, self.frames))
 
 
-COMMANDS = {
-    "import": Import, "check": Check, "view": View, "plot": Plot, "synthesize": Synthesize, "retarget": Retarget,
-}  # fmt: skip
-
-Motion = functools.reduce(
-    operator.or_, (Annotated[command, tyro.conf.subcommand(name)] for name, command in COMMANDS.items())
-)
+MOTION = Group(
+    "Import, check, fix, view, plot, make and retarget motions.",
+    {
+        "import": Import, "check": Check, "view": View, "plot": Plot, "synthesize": Synthesize, "retarget": Retarget,
+    },
+)  # fmt: skip

@@ -30,6 +30,7 @@ class Robot:
     """
 
     name: str
+    description: str  # what it is, in a line
     model: mujoco.MjModel
     joint_names: tuple[str, ...]
     joint_axis: np.ndarray  # [J, 3] unit axis in the joint's body
@@ -115,6 +116,7 @@ def _read(name: str, path: Path) -> Robot:
         default[7 + index[joint]] = angle
     robot = Robot(
         name=name,
+        description=facts.get("description") or f"{len(joint_names)} joints, {model.body_mass.sum():.0f} kg",
         model=model,
         joint_names=joint_names,
         joint_axis=model.jnt_axis[1:].copy(),
