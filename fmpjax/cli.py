@@ -164,11 +164,12 @@ class Train:
         from fmpjax import sharding
 
         config = configuration.preset(self.preset or _default_preset(), **self._changes())
-        from fmpjax import priors, robots
+        from fmpjax import memory, priors, robots
 
         priors.check(config.method)
         robots.load(config.robot)
         # Before there is a folder, which the corrected command would find taken.
+        memory.check(config, self.seeds or 1)
         if devices != 1:
             sharding.check_divides(config.env.count, self.seeds or 1, sharding.mesh(devices).size)
         stamp = datetime.now().strftime("%Y%m%d-%H%M%S")

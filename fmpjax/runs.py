@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from fmpjax import config as configuration
-from fmpjax import motion, policy, sharding, shell
+from fmpjax import memory, motion, policy, sharding, shell
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import Config
 from fmpjax.errors import UserError, out_of_memory
@@ -192,8 +192,9 @@ def train(*group: Run, resume: bool = False, minutes: float | None = None, devic
     Several devices, all of them for None, share the environments or the seeds.
 
     Raises:
-      UserError: the runs do not belong together, too much was not finite, or memory ran out; what was saved stays good.
+      UserError: the runs do not belong together, too much was not finite, or memory is too small; what was saved stays.
     """
+    memory.check(group[0].config, len(group))
     with _enough_memory(group), _held(group):
         return _train(*group, resume=resume, minutes=minutes, devices=devices)
 
