@@ -24,6 +24,9 @@ MEASURED = {
     ("laptop", "prior.bank=1024", "prior.minibatch=1024", "prior.query_is_bank=true"): 162.3,
     ("laptop", "prior.minibatch=2048"): 168.8,
     ("paper",): 831.3,
+    ("smoke", "method=barycentric", "env.count=512", "prior.bank=1024"): 187.8,
+    ("smoke", "method=bank16", "env.count=512", "prior.bank=1024"): 318.6,
+    ("smoke", "method=amp", "env.count=512"): 408.9,
 }
 
 
