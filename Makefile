@@ -14,6 +14,8 @@ UV := $(shell command -v uv 2>/dev/null)
 install = $(if $(UV),uv pip install --quiet --python $(BIN)/python,$(BIN)/python -m pip install --quiet \
   --disable-pip-version-check) -c constraints.txt -e
 
+comma := ,
+
 # --name 'value' where the variable is set, nothing where it is not.
 option = $(if $($(1)),--$(2) '$($(1))')
 train_options = $(strip \
@@ -21,6 +23,22 @@ train_options = $(strip \
   $(call option,ROBOT,robot) $(call option,MOTION,motion) $(call option,FRAMES,frames) \
   $(call option,SEED,seed) $(call option,SEEDS,seeds) $(call option,RUN,run) $(call option,MINUTES,minutes) \
   $(if $(filter-out 0 no false,$(RESUME)),--resume) $(ARGS))
+
+# A variable that is given on the command line and read by none of the targets is a slip: training would go on without it.
+known_train := METHOD RESET PRESET ROBOT MOTION FRAMES SEED SEEDS RUN MINUTES RESUME ARGS
+known_evaluate := RUN ARGS
+known_render := RUN ARGS
+known_test := WORKERS ARGS
+known_test-fast := ARGS
+goals := $(or $(MAKECMDGOALS),$(.DEFAULT_GOAL))
+known := $(foreach goal,$(goals),$(known_$(goal))) PYTHON UV VENV
+given := $(foreach name,$(.VARIABLES),$(if $(filter command,$(firstword $(origin $(name)))),$(name)))
+unknown := $(firstword $(filter-out $(known),$(given)))
+ifneq ($(unknown),)
+  close := $(shell for python in $(BIN)/python python3; do "$$python" -c 'import difflib, sys; \
+    print(*difflib.get_close_matches(sys.argv[1].upper(), sys.argv[2:], 1))' '$(unknown)' $(known) 2>/dev/null && break; done)
+  $(error unknown variable $(unknown)$(if $(close),$(comma) perhaps $(close)): make $(goals) takes $(strip $(known)))
+endif
 
 .PHONY: train evaluate render test test-fast check format build clean help run-is-named
 
@@ -66,7 +84,7 @@ run-is-named:
 # Interpreters are tried by running them: a name on the path may be a shim with no Python of that version behind it.
 $(READY): pyproject.toml constraints.txt
 	@if [ ! -x $(BIN)/python ]; then \
-	  if [ -n '$(UV)' ]; then uv venv --quiet --seed --python '$(or $(PYTHON),>=3.11,<3.14)' $(VENV); \
+	  if [ -n '$(UV)' ]; then uv venv --quiet --seed --python '$(or $(PYTHON),>=3.11$(comma)<3.14)' $(VENV); \
 	  else \
 	    for python in $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python); do \
 	      if "$$python" -c 'import ensurepip, sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null; \

@@ -2,6 +2,10 @@
 
 __version__ = "0.1.0"
 
-from fmpjax.robots import load as load_robot
+from fmpjax import machine
+
+machine.import_mujoco()
+
+from fmpjax.robots import load as load_robot  # noqa: E402 - after MuJoCo
 
 __all__ = ["load_robot"]

@@ -1,60 +1,73 @@
-"""The command line: ``fmpjax train``, ``evaluate``, ``diagnose``, ``render``, ``export``, ``report``, ``motion`` ..."""
+"""The command line: `fmpjax` with the commands in `COMMANDS`."""
 
 import dataclasses
 import math
 import os
 import sys
 import time
-import warnings
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import tyro
 
+import fmpjax
 from fmpjax import config as configuration
-from fmpjax.cli_motion import Motion
-from fmpjax.errors import UserError, out_of_memory
+from fmpjax import shell
+from fmpjax.cli_motion import MOTION
+from fmpjax.errors import UserError
+from fmpjax.shell import default
+
+
+def _setting(key: str) -> object:
+    """For ``Annotated``: the default of an option that overrides a setting, which may depend on the preset."""
+    presets: dict[str, list[str]] = {}
+    for name in configuration.PRESETS:
+        value = configuration.flatten(configuration.preset(name))[key]
+        presets.setdefault(f"{value:,}" if isinstance(value, int) else value, []).append(name)
+    if len(presets) == 1:
+        return default(*presets)
+    return default(", ".join(f"{value} in {' and '.join(names)}" for value, names in presets.items()))
 
 
 @dataclasses.dataclass(frozen=True)
 class Train:
     """Train a policy from a demonstration."""
 
-    method: str | None = None
-    """Motion prior, `fmp` by default."""
-    reset: str | None = None
+    method: Annotated[str | None, _setting("method")] = None
+    """Motion prior; `fmpjax list` shows all of them."""
+    reset: Annotated[str | None, _setting("env.reset")] = None
     """`dataset` (a demonstration state) or `fixed` (the default pose)."""
-    preset: str | None = None
-    """`smoke`, `laptop` (the default on a CPU) or `paper` (the default on an accelerator)."""
-    robot: str | None = None
-    """A robot under robots/, `unitree_g1` by default."""
-    motion: str | None = None
-    """A bundled motion's name, `walk` by default, or a file; several with weights as NAME[:WEIGHT],NAME[:WEIGHT]."""
-    frames: str | None = None
+    preset: Annotated[str | None, default("laptop on a CPU, paper on an accelerator")] = None
+    """`smoke`, `laptop` or `paper`."""
+    robot: Annotated[str | None, _setting("robot")] = None
+    """A robot under robots/."""
+    motion: Annotated[str | None, _setting("motion")] = None
+    """A bundled motion's name or a file; several with weights as NAME[:WEIGHT],NAME[:WEIGHT]."""
+    frames: Annotated[str | None, default("all")] = None
     """Source rows first:last of the motion, 0-based, both included; of several motions with commas between them."""
-    seed: int | None = None
+    seed: Annotated[int | None, _setting("seed")] = None
     """Seed of everything that is random."""
-    seeds: int | None = None
+    seeds: Annotated[int | None, default("a single run")] = None
     """Train as many seeds at once, from --seed on, in one program: the runs RUN/seed0, RUN/seed1, and so on."""
-    transitions: int | None = None
+    transitions: Annotated[int | None, _setting("transitions")] = None
     """Budget of environment steps; with --resume, a larger one than the run's lets it go on."""
-    run: Path | None = None
-    """Folder of the run, runs/METHOD-DATE-TIME by default."""
-    minutes: float | None = None
+    run: Annotated[Path | None, default("runs/METHOD-DATE-TIME")] = None
+    """Folder of the run."""
+    minutes: Annotated[float | None, default("no limit")] = None
     """Time budget: the run ends cleanly and can be resumed."""
     devices: int = 1
     """Devices that share the environments, or the seeds; 0 for every one that JAX sees."""
     distributed: bool = False
     """One of several processes that train together on all their devices, as SLURM starts them; see docs/scaling.md."""
-    coordinator: str | None = None
+    coordinator: Annotated[str | None, default("as the scheduler says")] = None
     """HOST:PORT of the first process, where no scheduler tells it."""
-    processes: int | None = None
+    processes: Annotated[int | None, default("as the scheduler says")] = None
     """Number of processes, likewise."""
-    process: int | None = None
+    process: Annotated[int | None, default("as the scheduler says")] = None
     """Number of this process, from 0, likewise."""
     resume: bool = False
-    """Go on with the run in --run."""
+    """Go on with the run in --run, with its settings."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Any other setting as section.field=value; see `fmpjax config`."""
 
@@ -151,11 +164,12 @@ class Train:
         from fmpjax import sharding
 
         config = configuration.preset(self.preset or _default_preset(), **self._changes())
-        from fmpjax import priors, robots
+        from fmpjax import memory, priors, robots
 
         priors.check(config.method)
         robots.load(config.robot)
         # Before there is a folder, which the corrected command would find taken.
+        memory.check(config, self.seeds or 1)
         if devices != 1:
             sharding.check_divides(config.env.count, self.seeds or 1, sharding.mesh(devices).size)
         print(runs.describe(config), flush=True)
@@ -192,8 +206,8 @@ class Evaluate:
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
-    episodes: int | None = None
-    """First episodes, as many as the run's configuration says by default."""
+    episodes: Annotated[int | None, default("the run's evaluation_episodes")] = None
+    """Number of first episodes."""
     last: bool = False
     """Take the newest checkpoint in place of the best."""
 
@@ -221,8 +235,8 @@ class Render:
     """Folder of the run."""
     seconds: float = 10.0
     """Length at most."""
-    out: Path | None = None
-    """File, RUN/policy.mp4 by default; .gif where no encoder is installed."""
+    out: Annotated[Path | None, default("RUN/policy.mp4")] = None
+    """File to write; .gif where no encoder is installed."""
     alone: bool = False
     """Leave the demonstration out, whose licence may not let a picture of it be passed on."""
 
@@ -276,8 +290,8 @@ class Report:
 
     folder: tyro.conf.Positional[Path]
     """Folder below which their results are."""
-    out: Path | None = None
-    """HTML page to write, FOLDER/report.html by default; the same in Markdown stands beside it."""
+    out: Annotated[Path | None, default("FOLDER/report.html")] = None
+    """HTML page to write; the same in Markdown stands beside it."""
 
     def __call__(self) -> None:
         _runs()
@@ -297,6 +311,23 @@ class ShowConfig:
     def __call__(self) -> None:
         for key, value in configuration.flatten(configuration.preset(self.preset)).items():
             print(f"{key} = {value}")
+
+
+@dataclasses.dataclass(frozen=True)
+class List:
+    """List methods, presets, robots and motions, each with what it is."""
+
+    def __call__(self) -> None:
+        from fmpjax import motion, priors, robots
+
+        for title, described in (
+            ("methods", priors.descriptions()),
+            ("presets", configuration.DESCRIPTIONS),
+            ("robots", {name: robots.load(name).description for name in robots.available()}),
+            ("motions", {name: motion.describe(name) for name in motion.bundled()}),
+        ):
+            width = max(map(len, described))
+            print("\n".join([f"{title}:", *(f"  {name:<{width}}  {text}" for name, text in described.items())]))
 
 
 def _runs():
@@ -321,33 +352,22 @@ def _default_preset() -> str:
     return "laptop" if jax.default_backend() == "cpu" else "paper"
 
 
+COMMANDS = shell.Group(
+    "Flow-Matched Motion Priors in JAX. `fmpjax --version` prints the version.",
+    {
+        "train": Train, "evaluate": Evaluate, "diagnose": Diagnose, "render": Render, "export": Export,
+        "report": Report, "motion": MOTION, "config": ShowConfig, "list": List,
+    },
+)  # fmt: skip
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: bad input is one sentence and exit code 2."""
-    commands = {"train": Train, "evaluate": Evaluate, "render": Render, "export": Export}
-    commands |= {"diagnose": Diagnose, "report": Report, "motion": Motion, "config": ShowConfig}
-    command = tyro.extras.subcommand_cli_from_dict(
-        commands, prog="fmpjax", description="Flow-Matched Motion Priors in JAX.", args=arguments
-    )
-    # The video encoder is a child process; it is started by exec at once and never touches JAX's threads.
-    warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
-    try:
-        command()
-    except UserError as error:
-        _refuse(str(error))
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except BrokenPipeError:  # who reads, `head` say, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
-    except Exception as error:
-        if out_of_memory(error):
-            _refuse("out of memory: fewer --episodes, or a smaller env.count or evaluation_episodes, need less")
-        raise
-
-
-def _refuse(sentence: str) -> NoReturn:
-    print(f"fmpjax: {sentence}", file=sys.stderr)
-    sys.exit(2)
+    with shell.ending():
+        if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+            print(f"fmpjax {fmpjax.__version__}")
+        else:
+            shell.parse(COMMANDS, "fmpjax", arguments)()
 
 
 if __name__ == "__main__":

@@ -1,12 +1,10 @@
-"""The commands under ``fmpjax motion``; another one is another class in `COMMANDS`."""
+"""The commands under ``fmpjax motion``; another one is another class in `MOTION`."""
 
 import dataclasses
-import functools
 import math
-import operator
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_type_hints
 
 import tyro
 
@@ -14,19 +12,20 @@ from fmpjax import motion, robots
 from fmpjax.errors import UserError
 from fmpjax.motion import MotionClip, gait
 from fmpjax.motion.gait import Style
+from fmpjax.shell import Group, default
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reading:
     """How a motion file is read."""
 
-    frames: str | None = None
+    frames: Annotated[str | None, default("all")] = None
     """Source rows first:last, 0-based, both included; 100: and :200 go to the file's end or from its start."""
-    fps: float | None = None
+    fps: Annotated[float | None, default("the file's own")] = None
     """Rate of the source rows in place of the file's own, Hz."""
     robot: str = "unitree_g1"
     """A robot under robots/."""
-    quaternion: str | None = None
+    quaternion: Annotated[str | None, default("told by the file")] = None
     """Order of the root's quaternion in place of the format's: wxyz or xyzw."""
     without: str = ""
     """Words, as wrist,waist_roll: the file lacks the joints with one in their name, and they are zero."""
@@ -69,7 +68,7 @@ class Import(Reading):
     """Rate to write, Hz."""
     mirror: bool = False
     """Reflect left and right."""
-    heading: float | None = None
+    heading: Annotated[float | None, default("as it is")] = None
     """Turn the way from start to end to this angle from +x, deg."""
     loop: bool = False
     """Bend the last 0.4 s so that the end meets the start."""
@@ -120,7 +119,7 @@ class Check(Source):
 
     fix: bool = False
     """Put the soles on the floor, take out flips, clip joints to their limits, say what was changed, check again."""
-    out: Path | None = None
+    out: Annotated[Path | None, default("none")] = None
     """File to write the fixed motion to, .npz."""
     axes: str = "world"
     """The run's features.axes, world or heading."""
@@ -155,8 +154,8 @@ class Check(Source):
 class View(Source):
     """Show a motion in MuJoCo's viewer; without a display, or with --out, as a picture."""
 
-    out: Path | None = None
-    """A contact sheet (.png) or a video (.mp4, .gif); NAME.png where there is no display."""
+    out: Annotated[Path | None, default("the viewer, or NAME.png without a display")] = None
+    """A contact sheet (.png) or a video (.mp4, .gif)."""
 
     def __call__(self) -> None:
         from fmpjax.viz import clip as show
@@ -173,8 +172,8 @@ class View(Source):
 class Plot(Source):
     """Draw a motion's root, feet and joints over time."""
 
-    out: Path | None = None
-    """File to write, NAME-plot.png by default."""
+    out: Annotated[Path | None, default("NAME-plot.png")] = None
+    """File to write."""
 
     def __call__(self) -> None:
         from fmpjax.viz import clip as show
@@ -183,14 +182,23 @@ class Plot(Source):
         print(f"wrote {show.plot(robots.load(self.robot), clip, self.out or f'{clip.name}-plot.png')}")
 
 
+class _Style(Style):
+    """A walk's style, as the help shows what it leaves open."""
+
+    __annotations__ = {
+        name: Annotated[kind, default("the robot's own")]
+        for name, kind in get_type_hints(Style, include_extras=True).items()
+    }
+
+
 @dataclasses.dataclass(frozen=True)
 class Synthesize:
     """Write a steady walk of our own; --speed 0 alone is standing."""
 
     out: Path
     """File to write, .npz."""
-    speed: float | None = None
-    """Ahead, m/s, negative backward; the robot's own by default."""
+    speed: Annotated[float | None, default("the robot's own")] = None
+    """Ahead, m/s, negative backward."""
     sideways: float = 0.0
     """To the left, m/s."""
     turn: float = 0.0
@@ -201,8 +209,8 @@ class Synthesize:
     """Hz."""
     robot: str = "unitree_g1"
     """A robot under robots/."""
-    style: Style = Style()
-    """How the walk looks: lengths m, angles rad, phases as fractions of a stride; the robot's own by default."""
+    style: _Style = _Style()
+    """How the walk looks: lengths m, angles rad, phases as fractions of a stride."""
 
     def __call__(self) -> None:
         robot = robots.load(self.robot)
@@ -221,13 +229,13 @@ class Retarget:
     """Motion capture, .bvh."""
     out: Path
     """File to write, .npz."""
-    frames: str | None = None
+    frames: Annotated[str | None, default("all")] = None
     """Frames first:last of the file, 0-based, both included; 1: goes to the end."""
     robot: str = "unitree_g1"
     """A robot under robots/."""
-    skeleton: Path | None = None
+    skeleton: Annotated[Path | None, default("known names")] = None
     """TOML file with the skeleton's joints of parts whose names are not known, as left_hip = "LThigh"."""
-    up: str | None = None
+    up: Annotated[str | None, default("told by the file")] = None
     """The file's axis that is up, y or z; by default the one along which hips are over ankles."""
 
     def __call__(self) -> None:
@@ -247,9 +255,9 @@ class Segment(Source):
 
     least: float = 2.0
     """Length of a stretch at least, s."""
-    out: Path | None = None
+    out: Annotated[Path | None, default("none")] = None
     """Folder to write the stretches to that are not broken, as NAME-KIND-FIRST.npz."""
-    picture: Path | None = None
+    picture: Annotated[Path | None, default("none")] = None
     """Picture of speed and kinds over time, .png."""
 
     def __call__(self) -> None:
@@ -269,11 +277,10 @@ class Segment(Source):
                     print(f"wrote {motion.save(stretch.clip, self.out / f'{stretch.clip.name}.npz')}")
 
 
-COMMANDS = {
-    "import": Import, "check": Check, "view": View, "plot": Plot, "synthesize": Synthesize, "retarget": Retarget,
-    "segment": Segment,
-}  # fmt: skip
-
-Motion = functools.reduce(
-    operator.or_, (Annotated[command, tyro.conf.subcommand(name)] for name, command in COMMANDS.items())
-)
+MOTION = Group(
+    "Import, check, fix, view, plot, cut, make and retarget motions.",
+    {
+        "import": Import, "check": Check, "view": View, "plot": Plot, "synthesize": Synthesize, "retarget": Retarget,
+        "segment": Segment,
+    },
+)  # fmt: skip

@@ -272,6 +272,11 @@ _SMOKE: dict[str, Any] = _LAPTOP | {
 }
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {"smoke": _SMOKE, "laptop": _LAPTOP, "paper": {}}
+DESCRIPTIONS = {
+    "smoke": "the whole path in a minute; learns nothing",
+    "laptop": "walks after about a quarter of an hour on two cores",
+    "paper": "the paper's setting, for an accelerator",
+}
 
 
 def preset(name: str, /, **changes: Any) -> Config:

@@ -36,8 +36,24 @@ class Policy(NamedTuple):
     low: np.ndarray  # [J] rad, of the targets
     high: np.ndarray  # [J] rad
 
+    def __repr__(self) -> str:
+        return (
+            f"Policy({len(self.mean)} {self.observation} observations -> {len(self.joint_names)} joint targets, "
+            f"layers {[len(bias) for bias in self.biases]}, {self.activation}, {self.rate:g} Hz)"
+        )
+
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Joint targets ``[..., J]`` (rad), for the servos to hold, from observations ``[..., O]``."""
+        """Joint targets ``[..., J]`` (rad), for the servos to hold, from observations ``[..., O]``.
+
+        Raises:
+          UserError: the observations have another length.
+        """
+        length = np.shape(observation)[-1:]
+        if length != self.mean.shape:
+            raise UserError(
+                f"the observation has {length[0] if length else 'no'} numbers: expected {len(self.mean)}, "
+                f"as the {self.observation!r} observation of this policy has"
+            )
         x = np.clip((observation - self.mean) / self.deviation, -self.clip, self.clip)
         for kernel, bias in zip(self.kernels[:-1], self.biases[:-1], strict=True):
             x = _ACTIVATIONS[self.activation](x @ kernel + bias)

@@ -34,6 +34,7 @@ class Robot:
     """
 
     name: str
+    description: str  # what it is, in a line
     model: mujoco.MjModel
     joint_names: tuple[str, ...]
     joint_axis: np.ndarray  # [J, 3] unit axis in the joint's body
@@ -89,7 +90,7 @@ class Robot:
         return model
 
     def takes(self, other: str) -> bool:
-        """Whether motions of the robot named ``other`` are this robot's, too: its joints and their order are the same."""
+        """Whether motions of the robot named ``other`` are this one's, too: both have the same joints in one order."""
         return other == self.name or (other in available() and load(other).joint_names == self.joint_names)
 
 
@@ -128,6 +129,7 @@ def _read(name: str, path: Path) -> Robot:
         default[7 + index[joint]] = angle
     robot = Robot(
         name=name,
+        description=facts.get("description") or f"{len(joint_names)} joints, {model.body_mass.sum():.0f} kg",
         model=model,
         joint_names=joint_names,
         joint_axis=model.jnt_axis[1:].copy(),

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import enum
-import fcntl
 import importlib.metadata
 import json
 import os
@@ -23,15 +22,21 @@ import jax
 import numpy as np
 
 from fmpjax import config as configuration
-from fmpjax import diagnose, motion, policy, robots, sharding
+from fmpjax import diagnose, memory, motion, policy, robots, sharding, shell
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import Config
 from fmpjax.errors import UserError, out_of_memory
 from fmpjax.evaluate import Evaluation, Evaluator, table
 from fmpjax.logs import MetricsLog, Progress, clock
+from fmpjax.machine import cores
 from fmpjax.motion import check
 from fmpjax.train import Trainer, TrainState, stack, unstack
 from fmpjax.viz import curves, render
+
+try:
+    import fcntl
+except ImportError:  # on Windows, where every command says that it does not run
+    fcntl = None
 
 _PACKAGES = "jax jaxlib mujoco mujoco-mjx brax flax optax ott-jax orbax-checkpoint numpy".split()
 
@@ -200,8 +205,9 @@ def train(*group: Run, resume: bool = False, minutes: float | None = None, devic
     Several devices, all of them for None, share the environments or the seeds.
 
     Raises:
-      UserError: the runs do not belong together, too much was not finite, or memory ran out; what was saved stays good.
+      UserError: the runs do not belong together, too much was not finite, or memory is too small; what was saved stays.
     """
+    memory.check(group[0].config, len(group))
     with _enough_memory(group), _held(group):
         return _train(*group, resume=resume, minutes=minutes, devices=devices)
 
@@ -315,7 +321,7 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
 def _held(group: Sequence[Run]) -> Iterator[None]:
     """Keep other processes from training in the run folders; a process that ends, however, lets go of them."""
     with contextlib.ExitStack() as held:
-        for run in group if sharding.primary() else ():
+        for run in group if fcntl and sharding.primary() else ():
             try:
                 lock = held.enter_context((run.folder / ".lock").open("w"))
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -395,22 +401,40 @@ def _start(trainer: Trainer, group: Sequence[Run], resume: bool) -> list[TrainSt
 
 
 def finish(run: Run) -> list[Path]:
-    """Evaluate the run's best policy, and write its table, learning curves and video; the paths written."""
+    """Evaluate the run's best policy, and write its table, learning curves and video; the paths written.
+
+    A picture that cannot be made is left out.
+    """
     trainer, state = run.policy()
     played = run.evaluator().play(state.ppo)
     evaluation = run.evaluator().measure(played)
     run.save_evaluation(evaluation)
     transitions = int(state.iteration) * trainer.config.transitions_per_iteration
     print(f"best policy, {transitions:,} transitions:\n{table(evaluation)}")
-    frames = _stride_frames(trainer, played)
-    render.contact_sheet(run.folder / "frames.png", frames, columns=6)
-    paths = [run.folder / "evaluation.json", run.folder / "frames.png"]
-    if (run.folder / "metrics.csv").exists():
-        if MetricsLog.read(run.folder / "metrics.csv"):
-            print(diagnose.text(diagnose.read(run.folder)))
-        curves.learning_curves(run.folder / "metrics.csv", run.folder / "curves.png")
-        paths.append(run.folder / "curves.png")
-    return [*paths, video(run, trainer, played)]
+    if (run.folder / "metrics.csv").exists() and MetricsLog.read(run.folder / "metrics.csv"):
+        print(diagnose.text(diagnose.read(run.folder)))
+    return [run.folder / "evaluation.json", *_pictures(run, trainer, played)]
+
+
+def _pictures(run: Run, trainer: Trainer, played) -> list[Path]:
+    """Draw a finished run; a picture that cannot be made is left out, which a line says."""
+
+    def frames() -> Path:
+        return render.contact_sheet(run.folder / "frames.png", _stride_frames(trainer, played), columns=6)
+
+    def course() -> Path:
+        return curves.learning_curves(run.folder / "metrics.csv", run.folder / "curves.png")
+
+    makers = {"frames.png": frames}
+    makers |= {"curves.png": course} if (run.folder / "metrics.csv").exists() else {}
+    makers |= {"policy.mp4": lambda: video(run, trainer, played)}
+    paths = []
+    for name, make in makers.items():
+        try:
+            paths.append(make())
+        except Exception as error:  # whatever it is, the training is finished
+            print(f"no {name}: {error or type(error).__name__}")
+    return paths
 
 
 _EXPORTED = (
@@ -490,26 +514,23 @@ def provenance() -> dict[str, object]:
         except (OSError, subprocess.SubprocessError):
             return None
 
-    # `python -m fmpjax.experiments.NAME` leaves the module's file as the program's name.
-    program = Path(sys.argv[0])
-    name = f"python -m fmpjax.experiments.{program.stem}" if program.parent.name == "experiments" else "fmpjax"
     changes = git("status", "--porcelain", "--untracked-files=no")
     return {
-        "command": f"{name} {shlex.join(sys.argv[1:])}",
+        "command": f"{shell.program()} {shlex.join(sys.argv[1:])}",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": git("rev-parse", "HEAD"),
         "uncommitted_changes": None if changes is None else bool(changes),
         "python": platform.python_version(),
         "packages": {name: importlib.metadata.version(name) for name in _PACKAGES},
         "device": machine(),
-        "cores": len(os.sched_getaffinity(0)),
+        "cores": cores(),
     }
 
 
 def machine() -> str:
     """The device that JAX computes on, in words."""
     device = jax.devices()[0]
-    return f"{len(os.sched_getaffinity(0))} CPU cores" if device.platform == "cpu" else device.device_kind
+    return f"{cores()} CPU cores" if device.platform == "cpu" else device.device_kind
 
 
 def _evaluation_names() -> list[str]:

@@ -45,3 +45,28 @@ def test_what_is_no_policy_is_refused(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(UserError, match=r"policy.npz is not a policy .*: expected policy.npz as `fmpjax export`"):
         policy.load(path)
+
+
+@pytest.fixture
+def small():
+    """A policy of three observations and two joints."""
+    return policy.Policy(
+        joint_names=("hip", "knee"), observation="compact", rate=50.0, activation="relu",
+        kernels=(np.ones((3, 4)), np.ones((4, 2))), biases=(np.zeros(4), np.zeros(2)),
+        mean=np.zeros(3), deviation=np.ones(3), clip=10.0,
+        center=np.zeros(2), scale=np.ones(2), low=np.full(2, -1.0), high=np.ones(2),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("shape", "has"), [((2,), "2 numbers"), ((4,), "4 numbers"), ((3, 1), "1 numbers"), ((), "no numbers")]
+)
+def test_an_observation_of_another_length_is_named(small, shape, has):
+    with pytest.raises(UserError, match=f"the observation has {has}: expected 3, as the 'compact' observation"):
+        small(np.zeros(shape))
+    assert small([0.0, 0.0, 0.0]).shape == (2,)
+
+
+def test_a_policy_is_printed_short(small):
+    assert repr(small) == str(small)
+    assert repr(small) == "Policy(3 compact observations -> 2 joint targets, layers [4, 2], relu, 50 Hz)"

@@ -1,13 +1,17 @@
 """Pictures: they come out with every renderer, show something, and never touch the physics."""
 
 import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 from PIL import Image
 
-from fmpjax import robots
+from fmpjax import robots, runs
 from fmpjax.errors import UserError
 from fmpjax.viz import curves, render
 
@@ -92,6 +96,79 @@ def test_no_driver_means_skeleton(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(render, "_PROBE", "raise SystemExit(1)")
     assert render.backend.__wrapped__() == "skeleton"
+
+
+@pytest.fixture
+def only_egl(monkeypatch):
+    """EGL draws, nothing else does, and nothing has been said yet."""
+    monkeypatch.setattr(render, "_HERE", ("egl", "osmesa"))
+    monkeypatch.setattr(render, "_draws", lambda name: name == "egl")
+    render._say.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ("", ""), ("egl", ""), ("glfw", ""),
+        ("wrong", "fmpjax: MUJOCO_GL is 'wrong', which draws nothing here: pictures are drawn by 'egl' instead\n"),
+        ("osmesa", "fmpjax: MUJOCO_GL is 'osmesa', which draws nothing here: pictures are drawn by 'egl' instead\n"),
+    ],
+)  # fmt: skip
+def test_another_backend_draws_where_the_one_asked_for_does_not(only_egl, monkeypatch, capsys, asked, said):
+    monkeypatch.setenv("MUJOCO_GL", asked)
+    assert render.backend.__wrapped__() == "egl"
+    assert capsys.readouterr().err == said
+
+
+def test_the_backend_asked_for_is_tried_first(monkeypatch):
+    tried = []
+    monkeypatch.setattr(render, "_HERE", ("egl", "osmesa"))
+    monkeypatch.setattr(render, "_draws", lambda name: not tried.append(name))
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    assert render.backend.__wrapped__() == "osmesa" and tried == ["osmesa"]
+
+
+def test_a_driver_that_fails_after_all_leaves_the_skeleton(robot, walk, monkeypatch, capsys):
+    def fail(name):
+        raise RuntimeError("no driver\nat all")
+
+    render._say.cache_clear()
+    monkeypatch.setattr(render.importlib, "import_module", fail)
+    frames = render.render_frames(robot, walk, using="egl", **SIZE)
+    np.testing.assert_array_equal(frames, render.render_frames(robot, walk, using="skeleton", **SIZE))
+    render.render_frames(robot, walk, using="egl", **SIZE)
+    assert capsys.readouterr().err == (
+        "fmpjax: the renderer 'egl' failed (no driver): pictures are drawn by 'skeleton' instead\n"
+    )
+
+
+def test_a_dead_display_gives_a_picture_and_a_sentence(tmp_path):
+    """In a process of its own: MuJoCo's viewer would end it."""
+    command = [sys.executable, "-m", "fmpjax.cli", "motion", "view", "strider_walk", "--robot", "strider"]
+    environment = os.environ | {"DISPLAY": ":77", "PYTHONPATH": str(Path(render.__file__).parents[2])}
+    environment.pop("WAYLAND_DISPLAY", None)
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "fmpjax: no window opens on DISPLAY ':77': a picture is drawn instead\n"
+    assert done.stdout == "wrote strider_walk.png\n"
+    with Image.open(tmp_path / "strider_walk.png") as image:
+        assert np.asarray(image.convert("L")).std() > 5
+
+
+def test_a_picture_that_fails_does_not_fail_a_finished_training(tmp_path, monkeypatch, capsys):
+    def fail(*arguments, **options):
+        raise RuntimeError("no driver")
+
+    def refuse(*arguments, **options):
+        raise UserError("cannot write policy.mp4: no space")
+
+    (tmp_path / "metrics.csv").write_text("")
+    run = runs.Run(tmp_path)
+    monkeypatch.setattr(runs, "_stride_frames", fail)
+    monkeypatch.setattr(runs, "video", refuse)
+    monkeypatch.setattr(runs.curves, "learning_curves", lambda table, picture: picture)
+    assert runs._pictures(run, None, None) == [tmp_path / "curves.png"]
+    assert capsys.readouterr().out == "no frames.png: no driver\nno policy.mp4: cannot write policy.mp4: no space\n"
 
 
 def _noise(count: int) -> np.ndarray:

@@ -8,21 +8,23 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 from fmpjax.experiments import cells, results, table
 from fmpjax.experiments.cells import Cell, Specification
+from fmpjax.shell import default
 
 
 def main(
     out: Path = Path("runs/ablate"),
-    spec: Path | None = None,
-    preset: str | None = None,
-    motion: str | None = None,
-    frames: str | None = None,
-    transitions: int | None = None,
-    methods: tuple[str, ...] | None = None,
-    resets: tuple[str, ...] | None = None,
-    seeds: tuple[int, ...] | None = None,
+    spec: Annotated[Path | None, default("none")] = None,
+    preset: Annotated[str | None, default(Specification.preset)] = None,
+    motion: Annotated[str | None, default(Specification.motion)] = None,
+    frames: Annotated[str | None, default("all")] = None,
+    transitions: Annotated[int | None, default("the preset's")] = None,
+    methods: Annotated[tuple[str, ...] | None, default(" ".join(Specification.methods))] = None,
+    resets: Annotated[tuple[str, ...] | None, default(" ".join(Specification.resets))] = None,
+    seeds: Annotated[tuple[int, ...] | None, default(" ".join(map(str, Specification.seeds)))] = None,
     workers: int = 1,
     together: bool = False,
     video: bool = False,
@@ -32,13 +34,13 @@ def main(
     Args:
       out: folder of the cells' runs and of the results.
       spec: TOML file with the keys below, `settings` and `variants`; the options below go before it.
-      preset: preset of every cell, `laptop` by default.
+      preset: preset of every cell.
       motion: a bundled motion's name or a file.
       frames: source rows "first:last" of the motion.
-      transitions: budget of every cell, the preset's by default.
-      methods: all six by default.
-      resets: `dataset` and `fixed` by default.
-      seeds: 0 by default.
+      transitions: budget of every cell.
+      methods: methods to compare.
+      resets: resets to train each from.
+      seeds: seeds of each.
       workers: cells that run at once, each on its share of the cores.
       together: train all seeds of a method and reset as one program, which pays on an accelerator.
       video: film the final policies of each reset's first seed side by side.

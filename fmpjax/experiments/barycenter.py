@@ -8,7 +8,7 @@ legs' velocity the average keeps, how many expert windows it is over, how fast i
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -19,6 +19,7 @@ from fmpjax.errors import UserError
 from fmpjax.experiments import results
 from fmpjax.experiments.results import Table, Verdict, number
 from fmpjax.features import FeatureMap
+from fmpjax.shell import default
 from fmpjax.train import Trainer
 from fmpjax.viz import panels
 from fmpjax.viz.panels import Line, Panel
@@ -180,7 +181,12 @@ def figure(record: Mapping[str, Any], path: Path) -> Path:
 
 
 def main(
-    out: Path, preset: str = "paper", motion: str = "walk", frames: str = "", seed: int = 0, smoke: bool = False
+    out: Path,
+    preset: str = "paper",
+    motion: str = "walk",
+    frames: Annotated[str, default("all")] = "",
+    seed: int = 0,
+    smoke: bool = False,
 ) -> None:
     """Reconstruct the barycentric baseline's first targets under either reset.
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from fmpjax.experiments import histories
 from fmpjax.experiments.reference import Reference, centred_error, correlation, cosine, reference, spread
 from fmpjax.logs import Progress, clock
 from fmpjax.priors import flow
+from fmpjax.shell import default
 from fmpjax.train import Trainer
 
 FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the way from a rollout's window to an expert's [P]
@@ -51,6 +52,9 @@ class Size:
 
 
 SMOKE = Size(environments=32, updates=4, banks=2, paths=16, cohort=8)
+
+
+Updates = Annotated[int | None, default(f"{Size.updates:,}; {SMOKE.updates:,} with --smoke")]
 
 
 def size(updates: int | None, smoke: bool) -> Size:

@@ -8,6 +8,7 @@ as ``python -m fmpjax.experiments.ranking --run RUN`` or, for the start of train
 import dataclasses
 import json
 from pathlib import Path
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ import numpy as np
 from fmpjax import features, priors
 from fmpjax.experiments import histories, results
 from fmpjax.motion import MotionClip, resample
+from fmpjax.shell import default
 from fmpjax.train import Trainer
 
 
@@ -98,7 +100,13 @@ def table(ranking: dict[str, dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def main(run: Path, start: bool = False, last: bool = False, updates: int = 512, out: Path | None = None) -> None:
+def main(
+    run: Path,
+    start: bool = False,
+    last: bool = False,
+    updates: int = 512,
+    out: Annotated[Path | None, default("RUN/ranking.json, or RUN/ranking-start.json with --start")] = None,
+) -> None:
     """Rank the demonstration and its copies under a reward fitted to a policy's windows.
 
     Args:
@@ -106,7 +114,7 @@ def main(run: Path, start: bool = False, last: bool = False, updates: int = 512,
       start: take the untrained policy.
       last: take the newest checkpoint in place of the best.
       updates: reward-model updates of the fit.
-      out: JSON file to write, RUN/ranking.json or RUN/ranking-start.json by default.
+      out: JSON file to write.
     """
     from fmpjax import runs
 

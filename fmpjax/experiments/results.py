@@ -4,14 +4,13 @@ import csv
 import json
 import math
 import os
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import tyro
-
+from fmpjax import shell
 from fmpjax.errors import UserError
+from fmpjax.shell import Group
 
 
 class Table(NamedTuple):
@@ -103,13 +102,7 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def entry(main: Callable[..., Any] | Mapping[str, Callable[..., Any]], arguments: Sequence[str] | None = None) -> None:
+def entry(main: Callable[..., Any] | Group, arguments: Sequence[str] | None = None) -> None:
     """An experiment's command line, or that of several by name: bad input is one sentence and exit code 2."""
-    parse = tyro.cli if callable(main) else tyro.extras.subcommand_cli_from_dict
-    try:
-        parse(main, args=arguments)
-    except UserError as error:
-        print(f"fmpjax: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
+    with shell.ending():
+        shell.parse(main, shell.program(), arguments)

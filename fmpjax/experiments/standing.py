@@ -26,6 +26,7 @@ from fmpjax.experiments import reference, results
 from fmpjax.priors import flow
 from fmpjax.priors.base import couple, median_reward
 from fmpjax.robots import Robot
+from fmpjax.shell import Group, default
 from fmpjax.train import Trainer, TrainState
 from fmpjax.viz import curves
 
@@ -321,7 +322,7 @@ def measure(
     out: Path,
     preset_name: str = "laptop",
     motion: str = "walk",
-    frames: str = "",
+    frames: Annotated[str, default("all")] = "",
     seed: int = 0,
     transitions: int = 6_000_000,
     every: int = 500_000,
@@ -387,5 +388,8 @@ def figure(out: Path, runs: tuple[Path, ...]) -> Path:
     return curves.comparison(out, {run.name: run / "standing.csv" for run in runs}, _PANELS)
 
 
+COMMANDS = Group("Measure why a policy stands before it walks.", {"measure": measure, "look": look, "figure": figure})
+
+
 if __name__ == "__main__":
-    results.entry({"measure": measure, "look": look, "figure": figure})
+    results.entry(COMMANDS)

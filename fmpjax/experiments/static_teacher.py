@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fmpjax.experiments import offline, results
-from fmpjax.experiments.offline import GROUPS
+from fmpjax.experiments.offline import GROUPS, Updates
 from fmpjax.experiments.results import Table, Verdict, number
 from fmpjax.viz import panels
 from fmpjax.viz.panels import Line, Panel
@@ -132,14 +132,14 @@ def figure(record: Mapping[str, Any], path: Path) -> Path:
     )
 
 
-def main(run: Path, walking: Path, out: Path, updates: int | None = None, smoke: bool = False, seed: int = 0) -> None:
+def main(run: Path, walking: Path, out: Path, updates: Updates = None, smoke: bool = False, seed: int = 0) -> None:
     """Fit FMP with dynamic and with static path supervision, and see what either costs and gives.
 
     Args:
       run: folder of a run whose newest policy stands.
       walking: folder of a run of the same demonstration whose best policy walks.
       out: folder for static_teacher.json, .csv and .png.
-      updates: of either, 9,216 by default.
+      updates: of either.
       smoke: the whole path, small; the figures mean nothing.
       seed: of everything random.
     """

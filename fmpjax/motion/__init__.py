@@ -2,6 +2,16 @@
 
 from fmpjax.motion.clip import MotionClip, resample, velocities
 from fmpjax.motion.formats import bundled, load, save
-from fmpjax.motion.library import MotionLibrary, load_library
+from fmpjax.motion.library import MotionLibrary, describe, load_library
 
-__all__ = ["MotionClip", "MotionLibrary", "bundled", "load", "load_library", "resample", "save", "velocities"]
+__all__ = [
+    "MotionClip",
+    "MotionLibrary",
+    "bundled",
+    "describe",
+    "load",
+    "load_library",
+    "resample",
+    "save",
+    "velocities",
+]

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from fmpjax import resources
 from fmpjax.errors import UserError
 from fmpjax.motion.clip import MotionClip
 from fmpjax.motion.formats import load
@@ -94,6 +95,16 @@ def load_library(
         load(name, frames=span or None, rate=rate, robot=robot) for (name, _), span in zip(entries, spans, strict=True)
     )
     return MotionLibrary(clips, shares(entries))
+
+
+def describe(name: str) -> str:
+    """What a bundled motion shows, in a line: robot, mean speed, turning where there is any, duration."""
+    with np.load(resources.folder("motions") / f"{name}.npz") as file:
+        robot = str(file["robot"])
+    clip = load(name, robot=robot)
+    speed, turn = np.linalg.norm(clip.qvel[:, :2], axis=1).mean(), clip.qvel[:, 5].mean()
+    way = f", turning {'left' if turn > 0 else 'right'} at {abs(turn):.2f} rad/s" if abs(turn) > 0.05 else ""
+    return f"{robot}, {speed:.2f} m/s{way}, {clip.duration:.1f} s"
 
 
 def parse(names: str) -> list[tuple[str, float]]:

@@ -4,7 +4,6 @@ On a CPU this is an order of magnitude faster than MJX. The callback is pure: th
 alone.
 """
 
-import os
 import threading
 
 import jax
@@ -13,6 +12,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
+from fmpjax import machine
 from fmpjax.config import PhysicsConfig
 from fmpjax.physics.base import PhysicsState
 from fmpjax.robots import Robot
@@ -26,7 +26,7 @@ class NativePhysics:
     def __init__(self, robot: Robot, config: PhysicsConfig):
         self.model = model(robot, config)
         self.substeps = config.substeps
-        self.threads = config.threads or len(os.sched_getaffinity(0))
+        self.threads = config.threads or machine.cores()
         self._pool = mujoco.rollout.Rollout(nthread=self.threads)
         self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
         self._turn = threading.Lock()  # several devices call back at once; the threads serve one after another

@@ -28,6 +28,11 @@ def make(method: str, expert: Expert, config: Config) -> MotionPrior:
     return _REGISTRY[method](expert, config)
 
 
+def descriptions() -> dict[str, str]:
+    """Methods and a line on each, the first of its ``make`` function's docstring."""
+    return {name: (make.__doc__ or "").partition("\n")[0] for name, make in _REGISTRY.items()}
+
+
 def normalizes(method: str) -> bool:
     """Whether the prior called ``method`` normalises windows itself, and so takes them unclipped."""
     return method in _OWN_NORMALIZER
@@ -54,6 +59,7 @@ __all__ = [
     "check",
     "check_potential",
     "couple",
+    "descriptions",
     "make",
     "median_reward",
     "normalizes",

@@ -129,7 +129,7 @@ def loss(apply, params, agent: jax.Array, demonstration: jax.Array, config: AMPC
 
 
 def make(expert: Expert, config: Config) -> MotionPrior:
-    """AMP against all windows of the demonstration."""
+    """Adversarial Motion Prior: a discriminator between all windows of the demonstration and the policy's."""
     settings = config.amp
     network = Discriminator(settings.hidden, settings.logit_init, expert.dimension)
     size = expert.windows.shape[-1]

@@ -60,7 +60,10 @@ def target(state: BarycentricState, condition: jax.Array) -> tuple[jax.Array, ja
 
 
 def make(expert: Expert, config: Config) -> MotionPrior:
-    """The barycentric baseline with temperature ``config.prior.temperature``."""
+    """Distance to the mean of the demonstration's matched windows, with no network.
+
+    Its temperature is ``config.prior.temperature``.
+    """
     settings = config.prior
     # Features are standardised coordinates times weight; d_g counts those of one full frame.
     per_frame = expert.dimension / expert.horizon

@@ -131,17 +131,17 @@ def losses(params, query, teacher: Teacher, flow: Flow, dimension, config: Prior
 
 
 def make(expert: Expert, config: Config) -> MotionPrior:
-    """FMP: all three losses."""
+    """Flow-Matched Motion Prior: a potential fitted to transport by three losses, of value, endpoint and flow."""
     return _make(expert, config.prior)
 
 
 def make_endpoint(expert: Expert, config: Config) -> MotionPrior:
-    """Endpoint: FMP without the flow loss, everything else the same."""
+    """FMP without the flow loss, everything else the same."""
     return _make(expert, dataclasses.replace(config.prior, flow_weight=0.0))
 
 
 def make_value(expert: Expert, config: Config) -> MotionPrior:
-    """Value: FMP without the flow and the endpoint loss, everything else the same."""
+    """FMP without the flow and the endpoint loss, everything else the same."""
     changed = dataclasses.replace(config.prior, flow_weight=0.0, endpoint_weight=0.0)
     return _make(expert, changed)
 

@@ -1,6 +1,7 @@
 """A clip to look at: in MuJoCo's viewer, as a contact sheet or video, as curves."""
 
 import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -25,8 +26,31 @@ KIND_COLOURS = dict(zip(KINDS, ("#b8b8b8", "#9b6fb0", "#2a6fb0", "#3a8a6b", "#c8
 
 
 def has_display() -> bool:
-    """Whether a window can be opened here."""
-    return sys.platform in ("darwin", "win32") or any(os.environ.get(v) for v in ("DISPLAY", "WAYLAND_DISPLAY"))
+    """Whether a window can be opened here; where one is promised and does not open, a sentence says so."""
+    if sys.platform == "darwin":
+        import mujoco.viewer
+
+        opens, where = mujoco.viewer._MJPYTHON is not None, "on macOS without mjpython"
+    else:
+        named = [f"{name} {os.environ[name]!r}" for name in ("DISPLAY", "WAYLAND_DISPLAY") if os.environ.get(name)]
+        if not named:
+            return False
+        opens, where = _window_opens(), f"on {' and '.join(named)}"
+    if not opens:
+        print(f"fmpjax: no window opens {where}: a picture is drawn instead", file=sys.stderr, flush=True)
+    return opens
+
+
+def _window_opens() -> bool:
+    """Try a window, in a process of its own: MuJoCo's viewer ends the process where none opens."""
+    code = (
+        "import glfw, sys; ready = glfw.init(); glfw.window_hint(glfw.VISIBLE, False);"
+        "sys.exit(not (ready and glfw.create_window(64, 64, '', None, None)))"
+    )
+    try:
+        return subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=30).returncode == 0
+    except subprocess.TimeoutExpired:
+        return False
 
 
 def play(robot: Robot, clip: MotionClip) -> None:

@@ -1,8 +1,8 @@
 """Videos of the robot without a screen and without root rights.
 
-MuJoCo draws through EGL or OSMesa, whichever works here; where neither does, a skeleton is plotted instead, so that a
-video always comes out. Configurations ``qpos [T, 7 + J]`` are in MuJoCo's order: root position (m), root quaternion
-wxyz, joint angles (rad). Frames are ``uint8 [T, H, W, 3]``.
+MuJoCo draws through EGL or OSMesa, on macOS through CGL, whichever works here; where none does, a skeleton is plotted
+instead, so that a video always comes out. Configurations ``qpos [T, 7 + J]`` are in MuJoCo's order: root position (m),
+root quaternion wxyz, joint angles (rad). Frames are ``uint8 [T, H, W, 3]``.
 """
 
 import contextlib
@@ -26,7 +26,10 @@ from scipy.ndimage import gaussian_filter1d
 from fmpjax.errors import UserError
 from fmpjax.robots import Robot
 
-BACKENDS = ("egl", "osmesa", "skeleton")
+BACKENDS = ("egl", "osmesa", "cgl", "skeleton")
+_HERE = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa")  # what MuJoCo may draw through on this system
+_OFF = ("disable", "disabled", "off", "false", "0")
+_ANY = ("", "enable", "enabled", "on", "true", "1", "glfw", "glx")  # what MuJoCo knows beside, and what needs a window
 
 AZIMUTH, ELEVATION = 125.0, -10.0  # deg; the robot walks along +x, past the camera and a little towards it
 SMOOTHING = 12.0  # frames, standard deviation of the camera's path
@@ -52,21 +55,32 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontSca
 
 @functools.cache
 def backend() -> str:
-    """What draws here: ``"egl"``, ``"osmesa"`` or ``"skeleton"``.
+    """What draws here, one of `BACKENDS`.
 
-    The environment variable ``MUJOCO_GL`` narrows the choice: ``egl`` or ``osmesa`` tries only that one, ``disable``
-    none.
+    The environment variable ``MUJOCO_GL`` may ask for ``egl``, ``osmesa`` or ``cgl``, which is tried first, or for
+    none of them by ``disable``. Where what it asks for does not draw, a sentence on standard error says what does.
     """
     asked = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if asked in ("disable", "disabled", "off", "false", "0"):
+    if asked in _OFF:
         return "skeleton"
-    for name in (asked,) if asked in BACKENDS[:2] else BACKENDS[:2]:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            command = [sys.executable, "-c", _PROBE, name]
-            environment = os.environ | {"MUJOCO_GL": name}
-            if subprocess.run(command, env=environment, capture_output=True, timeout=60).returncode == 0:
-                return name
-    return "skeleton"
+    found = next((name for name in sorted(_HERE, key=lambda name: name != asked) if _draws(name)), "skeleton")
+    if asked not in (*_ANY, found):
+        _say(f"MUJOCO_GL is {asked!r}, which draws nothing here: pictures are drawn by {found!r} instead")
+    return found
+
+
+def _draws(name: str) -> bool:
+    command = [sys.executable, "-c", _PROBE, name]
+    # A name that MuJoCo does not know would keep the probe from importing it.
+    environment = os.environ | {"MUJOCO_GL": name}
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        return subprocess.run(command, env=environment, capture_output=True, timeout=60).returncode == 0
+    return False
+
+
+@functools.cache  # once in a process
+def _say(sentence: str) -> None:
+    print(f"fmpjax: {sentence}", file=sys.stderr, flush=True)
 
 
 def render_frames(
@@ -112,14 +126,29 @@ def render_frames(
     frames = np.zeros((len(qpos), height, width, 3), np.uint8)
     if len(frames) == 0:
         return frames
-    draw = _skeleton if using == "skeleton" else functools.partial(_scene, using)
+    if using != "skeleton":
+        try:
+            _draw(functools.partial(_scene, using), robot, motions, captions, follow, frames)
+            return frames
+        except _DriverError as error:
+            _say(f"the renderer {using!r} failed ({error}): pictures are drawn by 'skeleton' instead")
+    _draw(_skeleton, robot, motions, captions, follow, frames)
+    return frames
+
+
+class _DriverError(Exception):
+    """MuJoCo cannot draw through a platform, though the probe could."""
+
+
+def _draw(draw, robot: Robot, motions, captions, follow: bool, frames: np.ndarray) -> None:
+    """Fill ``frames``, drawn by ``draw``: `_scene` or `_skeleton`."""
+    _, height, width, _ = frames.shape
     look, distance = _camera_path(robot, motions[0][:, :2], width / height, follow)
     with draw(robot, width, height, distance) as picture:
         for i, caption in enumerate(captions):
             frames[i] = picture([motion[i] for motion in motions], look[i])
             if caption:
                 frames[i] = _captioned(frames[i], caption)
-    return frames
 
 
 def grid(
@@ -228,9 +257,12 @@ def _scene(name: str, robot: Robot, width: int, height: int, distance: float) ->
     scene = mujoco.MjvScene(model, maxgeom=3 * model.ngeom + 100)
     rectangle = mujoco.MjrRect(0, 0, width, height)
     # mujoco.Renderer takes its platform from MUJOCO_GL at the first import of mujoco, which is long past.
-    platform = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
-    platform.make_current()
-    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    try:
+        platform = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+        platform.make_current()
+        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    except Exception as error:  # of any kind: each platform has its own
+        raise _DriverError(str(error).strip().partition("\n")[0] or type(error).__name__) from error
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
 
     def pose(qpos: np.ndarray) -> None:

@@ -1,0 +1,66 @@
+"""What this machine has and can do: cores, memory, systems that the package runs on."""
+
+import contextlib
+import os
+import sys
+from pathlib import Path
+
+_CGROUPS = "/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"  # version 2, version 1
+
+
+def unsupported() -> str | None:
+    """A sentence where the package does not run on this system, else None."""
+    if sys.platform == "win32":
+        return "Windows is not supported: use Linux, macOS or WSL (Windows Subsystem for Linux)"
+    return None
+
+
+def cores() -> int:
+    """Processor cores that this process may use."""
+    if hasattr(os, "process_cpu_count"):  # Python 3.13
+        return os.process_cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):  # Linux
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def memory() -> int | None:
+    """Bytes of main memory that this process may use, its container's where that has a limit; None if unknown."""
+    found = []
+    with contextlib.suppress(AttributeError, ValueError, OSError):
+        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    for path in _CGROUPS:
+        with contextlib.suppress(OSError, ValueError):  # "max" is no number
+            found.append(int(Path(path).read_text()))
+    return min((size for size in found if size > 0), default=None)
+
+
+def import_mujoco() -> None:
+    """Import MuJoCo also where ``MUJOCO_GL`` names a renderer that it cannot load.
+
+    MuJoCo reads the variable when it is imported, and fails then. Only `mujoco.Renderer` uses what it names;
+    `fmpjax.viz.render` finds its own renderer.
+    """
+    before = {name: os.environ.get(name) for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    try:
+        import mujoco  # noqa: F401
+    except Exception:
+        if not before["MUJOCO_GL"]:
+            raise
+        # OpenGL has settled on the platform that failed: it has to be imported again for another one.
+        for name in list(sys.modules):
+            if name.split(".")[0] == "OpenGL" or name.startswith(("mujoco.egl", "mujoco.osmesa", "mujoco.cgl")):
+                del sys.modules[name]
+        os.environ.pop("MUJOCO_GL")
+        _restore("PYOPENGL_PLATFORM", before["PYOPENGL_PLATFORM"])
+        try:
+            import mujoco  # noqa: F401
+        finally:
+            _restore("MUJOCO_GL", before["MUJOCO_GL"])
+
+
+def _restore(name: str, value: str | None) -> None:
+    if value is None:
+        os.environ.pop(name, None)
+    else:
+        os.environ[name] = value

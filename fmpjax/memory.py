@@ -1,0 +1,55 @@
+"""What a run needs of main memory at least, asked before it starts: the system kills a process that takes too much.
+
+On an accelerator nothing is estimated: its allocator refuses with an error, of which `fmpjax.runs` makes a sentence.
+"""
+
+import jax
+
+from fmpjax import features, machine, robots
+from fmpjax.config import Config
+from fmpjax.errors import UserError
+
+
+def parts(config: Config, seeds: int = 1) -> dict[str, int]:
+    """Bytes that a training program needs at least, by the setting that they grow with.
+
+    Only large arrays that exist at the same time are counted. The compiled programs that were measured (in
+    ``tests/test_memory.py``) take 1.2 to 2.7 times the sum.
+    """
+    prior, amp = config.prior, config.amp
+    window = 4 * config.features.history * len(features.compact_weights(robots.load(config.robot)))  # float32
+    # A rollout's windows, and once more on their way through the prior.
+    needed = {"env.count": 2 * config.transitions_per_iteration * window}
+    if config.method == "amp":
+        needed["amp.replay"] = amp.replay * window // 2  # float16
+        needed["amp.minibatch"] = 4 * amp.minibatch * window  # three kinds of windows, and slopes
+    else:
+        needed["prior.bank"] = 2 * 4 * prior.bank**2  # costs to another bank and to itself
+    if config.method in ("fmp", "endpoint", "value"):
+        # Queries, targets, points and their slopes; costs to both banks.
+        needed["prior.minibatch"] = prior.minibatch * (8 * window + 2 * 4 * prior.bank)
+    return {setting: seeds * size for setting, size in needed.items()}
+
+
+def check(config: Config, seeds: int = 1) -> None:
+    """Raise a `UserError` where a run, or one of so many seeds at once, cannot fit this machine's memory.
+
+    What is let through may still not fit: the estimate is a lower bound. Processes that train together share the work.
+    """
+    if jax.default_backend() != "cpu":
+        return
+    needed = {setting: size // jax.process_count() for setting, size in parts(config, seeds).items()}
+    has = machine.memory()
+    if has is None or sum(needed.values()) <= has:
+        return
+    largest = max(needed, key=needed.get)
+    section, _, field = largest.partition(".")
+    several = f", or --seeds (now {seeds})" if seeds > 1 else ""
+    raise UserError(
+        f"the run needs at least {_gib(sum(needed.values()))} of memory and this machine has {_gib(has)}: expected a "
+        f"smaller {largest} (now {getattr(getattr(config, section), field)}){several}"
+    )
+
+
+def _gib(size: int) -> str:
+    return f"{size / 2**30:,.1f} GiB"

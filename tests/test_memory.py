@@ -1,0 +1,86 @@
+"""The estimate of a run's memory stays below what compiled programs take, and not far below."""
+
+import dataclasses
+
+import jax
+import pytest
+from test_train import tiny
+
+from fmpjax import cli, machine, memory, motion, runs
+from fmpjax.config import preset
+from fmpjax.errors import UserError
+from fmpjax.train import Trainer
+
+# Temporary and argument bytes by `compiled.memory_analysis()`, in MB, on a CPU: JAX 0.10.2, the bundled walk.
+MEASURED = {
+    ("smoke",): 17.4,
+    ("smoke", "env.count=1024"): 381.6,
+    ("smoke", "method=amp"): 16.3,
+    ("smoke", "method=amp", "amp.minibatch=8192"): 281.9,
+    ("laptop",): 64.8,
+    ("laptop", "env.count=1024"): 459.1,
+    ("laptop", "env.count=4096"): 1810.6,
+    ("laptop", "prior.bank=1024"): 74.0,
+    ("laptop", "prior.bank=1024", "prior.minibatch=1024", "prior.query_is_bank=true"): 162.3,
+    ("laptop", "prior.minibatch=2048"): 168.8,
+    ("paper",): 831.3,
+    ("smoke", "method=barycentric", "env.count=512", "prior.bank=1024"): 187.8,
+    ("smoke", "method=bank16", "env.count=512", "prior.bank=1024"): 318.6,
+    ("smoke", "method=amp", "env.count=512"): 408.9,
+}
+
+
+@pytest.mark.parametrize("case", MEASURED, ids=" ".join)
+def test_estimate_is_below_what_was_measured(case):
+    name, *settings = case
+    estimate = sum(memory.parts(preset(name, **dict(item.split("=") for item in settings))).values())
+    assert 1.15 < 1e6 * MEASURED[case] / estimate < 2.75
+
+
+@pytest.mark.slow
+def test_estimate_is_below_what_a_program_takes():
+    config = tiny(**{"env.count": 512, "chunk": 1})
+    trainer = Trainer(config, motion.load("walk"))
+    program = jax.jit(trainer.iteration).lower(jax.eval_shape(trainer.init)).compile()
+    taken = program.memory_analysis()
+    estimate = sum(memory.parts(config).values())
+    assert estimate < taken.temp_size_in_bytes + taken.argument_size_in_bytes < 3 * estimate
+
+
+def test_estimate_grows_with_what_costs():
+    base = memory.parts(preset("laptop"))
+    assert memory.parts(preset("laptop"), 3) == {setting: 3 * size for setting, size in base.items()}
+    assert memory.parts(preset("laptop", **{"env.count": 256}))["env.count"] == 2 * base["env.count"]
+    assert memory.parts(preset("laptop", **{"prior.bank": 512}))["prior.bank"] == 4 * base["prior.bank"]
+    assert memory.parts(preset("laptop", robot="strider"))["env.count"] < base["env.count"]
+    assert memory.parts(preset("laptop", method="amp", **{"amp.replay": 10**9}))["amp.replay"] > 10**12
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("env.count", 10_000_000), ("prior.bank", 10_000_000), ("prior.minibatch", 10**9), ("amp.replay", 10**10)],
+)
+def test_what_cannot_fit_is_refused_before_it_starts(tmp_path, capsys, setting, value):
+    run, method = tmp_path / "run", "amp" if setting.startswith("amp") else "fmp"
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["train", "--preset", "smoke", "--method", method, "--run", str(run), "--set", f"{setting}={value}"])
+    assert exit_.value.code == 2 and not run.exists()
+    error = capsys.readouterr().err
+    assert error.startswith("fmpjax: the run needs at least ") and error.count("\n") == 1
+    assert f"GiB of memory and this machine has {machine.memory() / 2**30:,.1f} GiB" in error
+    assert error.endswith(f"expected a smaller {setting} (now {value})\n")
+
+
+def test_a_smaller_machine_refuses_a_resume_and_seeds(tmp_path, monkeypatch):
+    config = preset("smoke")
+    needed = sum(memory.parts(config).values())
+    made = [runs.Run.create(tmp_path / str(seed), dataclasses.replace(config, seed=seed)) for seed in (0, 1)]
+    monkeypatch.setattr(machine, "memory", lambda: needed)
+    memory.check(config)
+    with pytest.raises(UserError, match=r"smaller env.count \(now 16\), or --seeds \(now 2\)"):
+        runs.train(*made, resume=True)
+    monkeypatch.setattr(machine, "memory", lambda: None)
+    memory.check(config, 1000)
+    monkeypatch.setattr(machine, "memory", lambda: 1)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # whose allocator refuses
+    memory.check(config)

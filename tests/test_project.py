@@ -1,0 +1,115 @@
+"""What stands beside the package: requirements, Makefile, examples in the documents."""
+
+import doctest
+import os
+import re
+import shutil
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from fmpjax import transport
+
+ROOT = Path(__file__).resolve().parent.parent
+IMPORTED_AS = {
+    "imageio-ffmpeg": "imageio_ffmpeg", "mujoco-mjx": "mujoco", "orbax-checkpoint": "orbax", "ott-jax": "ott",
+    "pillow": "PIL",
+}  # fmt: skip
+
+
+def _name(requirement: str) -> str:
+    return re.match(r"[A-Za-z0-9-]+", requirement)[0].lower()
+
+
+def test_every_requirement_is_imported_and_pinned():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    pinned = {line.partition("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines()}
+    code = "\n".join(path.read_text() for path in (ROOT / "fmpjax").rglob("*.py"))
+    optional = project["optional-dependencies"]
+    for requirement in [*project["dependencies"], *optional["viz"], *optional["retarget"]]:
+        name = _name(requirement)
+        module = IMPORTED_AS.get(name, re.match(r"[A-Za-z0-9-]+", requirement)[0])
+        assert re.search(rf"^\s*(import|from) {module}\b|import_module\(\"{module}\"\)", code, re.MULTILINE), name
+        assert name in pinned, name
+    assert {_name(requirement) for requirement in optional["dev"]} <= pinned
+
+
+def test_the_examples_of_docstrings_are_right():
+    found = doctest.testmod(transport)
+    assert found.attempted and not found.failed
+
+
+def _blocks():
+    """The README's examples in Python; the next one goes on with what one leaves."""
+    return re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.slow
+def test_the_examples_of_the_readme_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names, blocks = {}, _blocks()
+    assert blocks
+    for block in blocks:
+        exec(compile(block, "README.md", "exec"), names)
+
+
+# --- make ------------------------------------------------------------------------------------------------------------
+
+needs_make = pytest.mark.skipif(not shutil.which("make"), reason="no make here")
+
+
+def _make(*arguments: str) -> subprocess.CompletedProcess:
+    # What is running these tests may itself be make, with variables of its own.
+    environment = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS")}
+    return subprocess.run(
+        ["make", "--dry-run", *arguments], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60
+    )
+
+
+@needs_make
+@pytest.mark.parametrize(
+    ("arguments", "unknown"),
+    [
+        (("train", "PRESETT=smoke"), r"PRESETT, perhaps PRESET: make train takes METHOD RESET PRESET .*"),
+        (("train", "preset=smoke"), r"preset, perhaps PRESET: make train takes .*"),
+        (("train", "OPTIMIZER=adam"), r"OPTIMIZER: make train takes .*"),
+        (("evaluate", "RUN=a", "PRESET=smoke"), r"PRESET: make evaluate takes RUN ARGS .*"),
+        (("PRESET=smoke",), r"PRESET: make help takes .*"),
+        *(((target, "XYZ=1"), rf"XYZ: make {target} takes .*")
+          for target in ("render", "test", "test-fast", "check", "format", "build", "clean", "help")),
+    ],
+)  # fmt: skip
+def test_make_refuses_an_unknown_variable(arguments, unknown):
+    done = _make(*arguments)
+    assert done.returncode == 2 and done.stdout == ""
+    assert re.fullmatch(rf"Makefile:\d+: \*\*\* unknown variable {unknown}\.  Stop\.\n", done.stderr), done.stderr
+
+
+@needs_make
+def test_make_takes_its_variables():
+    done = _make("train", "METHOD=amp", "PRESET=smoke", "SEEDS=2", "RESUME=1", "ARGS=--set ppo.discount=0.9")
+    assert done.returncode == 0, done.stderr
+    assert "train --method 'amp' --preset 'smoke' --seeds '2' --resume --set ppo.discount=0.9" in done.stdout
+    assert _make("test", "WORKERS=3", "ARGS=tests/test_project.py").returncode == 0
+    assert _make("evaluate", "RUN=runs/a b").returncode == 0
+    assert _make("check", "test", "WORKERS=3").returncode == 0  # what one of several targets takes
+    fresh = _make("clean", "check", "UV=uv", "VENV=nowhere").stdout
+    assert "uv venv --quiet --seed --python '>=3.11,<3.14' nowhere" in fresh
+
+
+@needs_make
+@pytest.mark.skipif(not (ROOT / ".ci").is_dir(), reason="the source archive leaves it out")
+def test_the_check_of_a_submission_lints_and_tests_and_installs_once(tmp_path):
+    """On a machine that has nothing: `make` prints what it would do."""
+    stub = tmp_path / "make"
+    stub.write_text(f'#!/bin/sh\nexec {shutil.which("make")} --dry-run VENV=nowhere UV=uv "$@"\n')
+    stub.chmod(0o755)
+    environment = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS")}
+    environment["PATH"] = f"{tmp_path}{os.pathsep}{environment['PATH']}"
+    done = subprocess.run([ROOT / ".ci" / "run"], env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count(".[dev,viz,retarget]") == 1
+    lint, first_test = done.stdout.index("nowhere/bin/ruff check"), done.stdout.index("-m pytest")
+    assert done.stdout.index(".[dev,viz,retarget]") < lint < first_test
