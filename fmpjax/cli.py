@@ -192,7 +192,7 @@ class Evaluate:
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     episodes: int | None = None
-    """First episodes, as many as the run's configuration says by default."""
+    """First episodes of the headline's starts, as many as the run's configuration says by default; docs/metrics.md."""
     last: bool = False
     """Take the newest checkpoint in place of the best."""
 

@@ -6,14 +6,13 @@ as ``python -m fmpjax.experiments.ranking --run RUN`` or, for the start of train
 """
 
 import dataclasses
-import json
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import features, priors
+from fmpjax import features, jsons, priors
 from fmpjax.experiments import histories, results
 from fmpjax.motion import MotionClip, resample
 from fmpjax.train import Trainer
@@ -125,7 +124,7 @@ def main(run: Path, start: bool = False, last: bool = False, updates: int = 512,
     print(f"pool: {played.valid.size} windows, mean forward speed {played.speed:.3f} m/s")
     print(table(ranking))
     path.parent.mkdir(parents=True, exist_ok=True)
-    runs.write(path, json.dumps({"pool_speed": played.speed, "updates": updates, "windows": ranking}, indent=1))
+    runs.write(path, jsons.dumps({"pool_speed": played.speed, "updates": updates, "windows": ranking}))
     print(f"wrote {path}")
 
 
