@@ -207,7 +207,7 @@ class Evaluate:
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     episodes: Annotated[int | None, default("the run's evaluation_episodes")] = None
-    """Number of first episodes."""
+    """First episodes of the headline's starts; docs/metrics.md."""
     last: bool = False
     """Take the newest checkpoint in place of the best."""
 

@@ -7,10 +7,12 @@ defaults of the dataclasses are the paper's; `PRESETS` says where ``smoke`` and 
 import dataclasses
 import difflib
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from fmpjax import jsons
 from fmpjax.errors import UserError
 
 
@@ -156,6 +158,8 @@ class Config:
     # Simulation goes on through an evaluation, where the paper's starts anew [D].
     evaluations: tuple[float, ...] = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)  # shares of the budget at which to evaluate [P]
     evaluation_episodes: int = 1024  # first episodes of an evaluation [P]
+    # rad, deviations of joint angles at an evaluation's starts, ten times that in rad/s; docs/metrics.md [D: none]
+    evaluation_noise: tuple[float, ...] = (0.0, 1e-3, 1e-2)
     chunk: int = 14  # iterations in one call of the compiled program; 1,526 rollouts are 109 calls [D]
     nonfinite_limit: int = 1000  # environments reset or updates skipped for non-finite numbers before a run stops [D]
     physics: PhysicsConfig = PhysicsConfig()
@@ -312,12 +316,17 @@ def _convert(key: str, value: Any, like: Any) -> Any:
     try:
         if kind is tuple:
             items = value.strip("()[] ").split(",") if isinstance(value, str) else value
-            return tuple(type(like[0])(item) for item in items if item != "")
+            values = tuple(type(like[0])(item) for item in items if item != "")
+            if not all(map(math.isfinite, values)):
+                raise ValueError
+            return values
         if kind is bool and isinstance(value, str):
             return {"true": True, "1": True, "false": False, "0": False}[value.lower()]
         if kind is int and isinstance(value, str):
             return int(value.replace("_", ""))
         if kind is int and (isinstance(value, bool) or value != int(value)):
+            raise ValueError
+        if kind is float and not math.isfinite(float(value)):
             raise ValueError
         return kind(value)
     except (ValueError, TypeError, KeyError, OverflowError):
@@ -338,7 +347,7 @@ def flatten(config: Config) -> dict[str, Any]:
 
 def to_json(config: Config) -> str:
     """The settings as a flat JSON object."""
-    return json.dumps(flatten(config), indent=1)
+    return jsons.dumps(flatten(config))
 
 
 # What settings were before they existed, where that is not the default: what an older file without them means.
@@ -396,6 +405,13 @@ def validate(config: Config) -> Config:
     for key in ("prior.parallel_solves", "physics.threads", "env.reset_noise"):
         if flat[key] < 0:
             raise UserError(f"setting {key} is {flat[key]}: expected 0 or more")
+    noise = config.evaluation_noise
+    # Columns of the metrics are named after the sizes as they are printed.
+    if not noise or min(noise) < 0 or len({f"{size:g}" for size in noise}) < len(noise):
+        raise UserError(
+            f"setting evaluation_noise is {', '.join(f'{size:g}' for size in noise) or 'empty'}: "
+            "expected sizes of 0 or more, in rad, each once"
+        )
     for key in ("ppo.discount", "ppo.gae_lambda", "prior.query_share"):
         if not 0 < flat[key] <= 1:
             raise UserError(f"setting {key} is {flat[key]}: expected a number in (0, 1]")

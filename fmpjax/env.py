@@ -160,19 +160,25 @@ class Env:
             before = jnp.maximum(before, jnp.asarray(starts)[jnp.searchsorted(starts, rows, side="right") - 1])
         return jnp.where(rows == self.clip_rows, rows, before)
 
-    def _begin(self, rows: jax.Array, key: jax.Array | None) -> tuple[physics.PhysicsState, Observed]:
-        """States at the table rows ``[N]`` and what is observed of them; with a key, joints are off by reset_noise."""
+    def _begin(
+        self, rows: jax.Array, key: jax.Array | None, noise: jax.Array | None = None
+    ) -> tuple[physics.PhysicsState, Observed]:
+        """States at the table rows ``[N]`` and what is observed of them; with a key, joints are off by the noise."""
         qpos, qvel = jnp.asarray(self._qpos)[rows], jnp.asarray(self._qvel)[rows]
-        noise = self.config.reset_noise
-        if key is None or not noise:
+        noise = self.config.reset_noise if noise is None else noise[:, None]
+        if key is None or (isinstance(noise, float) and not noise):
             return physics.reset(qpos, qvel), jax.tree.map(lambda table: jnp.asarray(table)[rows], self._table)
         angle, velocity = noise * jax.random.normal(key, (2, len(rows), self.robot.joint_count))
         qpos, qvel = qpos.at[:, 7:].add(angle), qvel.at[:, 6:].add(10.0 * velocity)
         return physics.reset(qpos, qvel), self._observe(qpos, qvel)
 
-    def start_at(self, rows: jax.Array, key: jax.Array | None = None) -> EnvState:
-        """Environments at the table rows ``[N]``, episodes beginning; exactly there unless a key is given."""
-        state, observed = self._begin(rows, key)
+    def start_at(self, rows: jax.Array, key: jax.Array | None = None, noise: jax.Array | None = None) -> EnvState:
+        """Environments at the table rows ``[N]``, episodes beginning; exactly there unless a key is given.
+
+        With a key, joint angles are off by ``noise [N]`` rad (standard deviation), by ``reset_noise`` where it is not
+        given, and joint velocities by ten times that in rad/s.
+        """
+        state, observed = self._begin(rows, key, noise)
         return EnvState(
             physics=state,
             observed=observed,

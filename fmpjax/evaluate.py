@@ -1,9 +1,9 @@
 """Evaluation of a frozen policy on first episodes (section IV-C of the paper)."""
 
 import dataclasses
-import json
+from collections.abc import Iterable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,18 +11,28 @@ import numpy as np
 from ott.geometry import geometry
 from ott.tools import sinkhorn_divergence
 
-from fmpjax import features, kinematics, metrics, rotations, transport
+from fmpjax import features, jsons, kinematics, metrics, rotations, transport
+from fmpjax.config import Config, FeatureConfig
+from fmpjax.env import EnvState
 from fmpjax.motion import MotionClip
 from fmpjax.ppo import PPOState
 from fmpjax.train import Trainer
 
-DETAILED = 64  # episodes whose joints and feet are analysed [P]
+DETAILED = 64  # episodes whose late speed, joints and feet are analysed [P]
 WINDOWS = 512  # windows at most on either side of the Sinkhorn discrepancy [D]
 CONTACT_HEIGHT = 0.01  # m, a foot is in contact where a sole point is lower [D]
 
 
+class Start(NamedTuple):
+    """First episodes whose starts are perturbed by one size of noise."""
+
+    noise: float  # rad, standard deviation of the joint angles; ten times that in rad/s of their velocities
+    episodes: int
+    falls: int
+
+
 class Episodes(NamedTuple):
-    """First episodes of N environments over T steps; after a fall the state stands still."""
+    """First episodes of N environments over T steps, of the headline's size; after a fall the state stands still."""
 
     qpos: np.ndarray  # [T, N, 7 + J]
     qvel: np.ndarray  # [T, N, 6 + J]
@@ -31,6 +41,7 @@ class Episodes(NamedTuple):
     start_qpos: np.ndarray  # [N, 7 + J]
     history: np.ndarray  # [N, H, F] compact frames up to the start
     clip: np.ndarray  # [N] index of the demonstration that it starts in, 0 for the default pose
+    starts: tuple[Start, ...] = ()  # every size, the headline's included, the smallest first
 
 
 class Share(NamedTuple):
@@ -39,7 +50,8 @@ class Share(NamedTuple):
     motion: str
     episodes: int
     falls: int
-    late_speed: float  # m/s, along the own heading where the demonstration turns
+    late_speed: float  # m/s, along the own heading where the demonstration turns; of the detailed episodes
+    late_n: int  # episodes behind it
     demonstration_speed: float  # m/s
 
 
@@ -47,18 +59,19 @@ class Share(NamedTuple):
 class Evaluation:
     """The evaluation's figures; `as_dict` names them as the metrics files do."""
 
+    noise: float  # rad, of the starts that all figures but `starts` are of
     episodes: int
     falls: int
     mean_length: float  # steps
-    late_speed: float  # m/s
-    late_n: int  # episodes behind the late speed
+    late_speed: float  # m/s, of the detailed episodes
+    late_n: int  # episodes behind the late speed, at most 64
     late_deviation: float  # m/s, between episodes
     path_speed: float  # m/s, late, along the robot's own heading
     turn: float  # rad/s, late, to the left
     excursion: float
     excursion_n: int
     amplitude_mae: float  # degrees
-    sinkhorn: float
+    discrepancy: float  # Sinkhorn, in the paper's features
     contact_foot_speed: float  # m/s
     imbalance: float
     displacement: float  # m
@@ -67,6 +80,7 @@ class Evaluation:
     demonstration_turning: float  # rad/s, either way
     joint_ranges: tuple[float, ...]  # degrees, six sagittal joints
     expert_ranges: tuple[float, ...]  # degrees
+    starts: tuple[Start, ...] = ()  # falls at every size of perturbation
     motions: tuple[Share, ...] = ()  # where there are several
 
     @property
@@ -80,33 +94,81 @@ class Evaluation:
         return (1.0 - self.falls / self.episodes) * max(0.0, 1.0 - error)
 
     def as_dict(self) -> dict[str, float]:
-        """Scalar figures, by name."""
-        values = dataclasses.asdict(self) | {"quality": self.quality}
-        return {name: value for name, value in values.items() if not isinstance(value, tuple)}
+        """Scalar figures, by name; `names` says which."""
+        values = {name: value for name, value in vars(self).items() if not isinstance(value, tuple)}
+        counts = [count for start in self.starts for count in (start.falls, start.episodes)]
+        sized = _sized(start.noise for start in self.starts)
+        return values | {"quality": self.quality} | dict(zip(sized, counts, strict=True))
+
+    def record(self) -> dict[str, Any]:
+        """All figures, for JSON; what is not defined is NaN."""
+        values = vars(self) | {"quality": self.quality, "starts": [start._asdict() for start in self.starts]}
+        motions = [share._asdict() for share in values.pop("motions")]
+        return values | ({"motions": motions} if motions else {})
 
     def to_json(self) -> str:
         """All figures; what is not defined is null."""
-        values = dataclasses.asdict(self) | {"quality": self.quality}
-        motions = [_defined(share._asdict()) for share in values.pop("motions")]
-        return json.dumps(_defined(values | ({"motions": motions} if motions else {})), indent=1)
+        return jsons.dumps(self.record())
+
+
+def names(config: Config) -> list[str]:
+    """Names of an evaluation's scalar figures, those of `Evaluation.as_dict`."""
+    plain = [field.name for field in dataclasses.fields(Evaluation) if "tuple" not in str(field.type)]
+    return [*plain, "quality", *_sized(sorted(config.evaluation_noise))]
+
+
+def _sized(sizes: Iterable[float]) -> list[str]:
+    return [f"{figure}_at_{size:g}" for size in sizes for figure in ("falls", "episodes")]
+
+
+def episodes_of(config: Config, episodes: int) -> dict[float, int]:
+    """Episodes to play at each size of perturbation, the headline's first.
+
+    The headline is the smallest size at which episodes differ: the demonstration's states as they are, and from the
+    fixed pose the smallest perturbation. The other sizes have a third of its episodes; the fixed pose without a
+    perturbation has one, since all would be the same.
+    """
+    fixed, sizes = config.env.reset == "fixed", sorted(config.evaluation_noise)
+    headline = next((size for size in sizes if size > 0 or not fixed), sizes[0])
+    counts = {headline: episodes} | {size: -(-episodes // 3) for size in sizes if size != headline}
+    return counts | ({0.0: 1} if fixed and 0.0 in counts else {})
 
 
 class Evaluator:
-    """First episodes of a trainer's environments under a deterministic policy, compiled once."""
+    """First episodes of a trainer's environments under a deterministic policy, compiled once.
+
+    Every size of perturbation is in one batch, the headline's episodes first.
+    """
 
     def __init__(self, trainer: Trainer, episodes: int | None = None, seed: int = 1):
         self.trainer = trainer
-        self.count = episodes or trainer.config.evaluation_episodes
-        # Matched resets: every evaluation of a configuration starts from the same states.
-        robot = trainer.robot
+        robot, env = trainer.robot, trainer.env
+        self._sizes = episodes_of(trainer.config, episodes or trainer.config.evaluation_episodes)
+        self.noise, self.count = next(iter(self._sizes.items()))
         self._poses = jax.jit(partial(kinematics.body_poses, robot))
         self._frames = jax.jit(lambda qpos, qvel: features.observe(robot, qpos, qvel, "compact").frame)
-        self.rows = np.asarray(trainer.env.reset_rows(jax.random.PRNGKey(seed), self.count))
+        # Every evaluation of a configuration starts from the same states, perturbations included.
+        key = jax.random.PRNGKey(seed)
+        rows = np.asarray(env.reset_rows(key, max(self._sizes.values())))
+        self.rows = np.concatenate([rows[:count] for count in self._sizes.values()])
+        self._noise = np.repeat(np.float32(list(self._sizes)), list(self._sizes.values()))
+        self._key = np.asarray(jax.random.fold_in(key, 2))
+        # The discrepancy is in the paper's features whatever the run's own are, so that it compares.
+        paper = FeatureConfig(history=env.horizon)
+        windows, share = env.clip_windows(), env.window_share()
+        self._feature_map = features.fit_feature_map(robot, windows, paper, share)
+        expert = np.arange(0, len(windows), max(1, len(windows) // WINDOWS))
+        if share is not None:
+            expert = trainer.expert.bank_rows(jax.random.PRNGKey(0), WINDOWS)
+        self._expert = self._feature_map(windows[expert])
+
+    def start(self) -> EnvState:
+        """The episodes' starts, the headline's first."""
+        return self.trainer.env.start_at(jnp.asarray(self.rows), self._key, jnp.asarray(self._noise))
 
     @partial(jax.jit, static_argnums=0)
     def _play(self, state: PPOState):
-        env = self.trainer.env
-        start = env.start_at(jnp.asarray(self.rows))
+        env, headline, start = self.trainer.env, self.count, self.start()
         policy = self.trainer.ppo.act(state, deterministic=True)
 
         def step(carry, _):
@@ -123,12 +185,12 @@ class Evaluator:
 
             sim = jax.tree.map(hold, reached, sim)
             observed = jax.tree.map(hold, observation, observed)
-            return (sim, observed, still_alive, length), (sim.qpos, sim.qvel)
+            return (sim, observed, still_alive, length), (sim.qpos[:headline], sim.qvel[:headline])
 
-        alive = jnp.ones(self.count, bool)
+        alive = jnp.ones(len(self.rows), bool)
         carry, (qpos, qvel) = jax.lax.scan(
             step,
-            (start.physics, start.observed, alive, jnp.zeros(self.count, jnp.int32)),
+            (start.physics, start.observed, alive, jnp.zeros(len(self.rows), jnp.int32)),
             None,
             length=env.config.episode_steps,
         )
@@ -136,7 +198,14 @@ class Evaluator:
 
     def play(self, state: PPOState) -> Episodes:
         """First episodes under ``state``'s mean action."""
-        return Episodes(*map(np.asarray, self._play(state)), self.trainer.env.clip_of(self.rows))
+        headline = slice(0, self.count)
+        qpos, qvel, *each = map(np.asarray, self._play(state))
+        length, fell, start_qpos, history = (values[headline] for values in each)
+        clip = self.trainer.env.clip_of(self.rows[headline])
+        ends = np.cumsum(list(self._sizes.values()))
+        falls = [int(part.sum()) for part in np.split(each[1], ends[:-1])]
+        starts = sorted(map(Start, self._sizes, self._sizes.values(), falls))
+        return Episodes(qpos, qvel, length, fell, start_qpos, history, clip, tuple(starts))
 
     def __call__(self, state: PPOState) -> Evaluation:
         return self.measure(self.play(state))
@@ -147,14 +216,13 @@ class Evaluator:
         rate = trainer.config.control_rate
         heading = rotations.yaw(played.start_qpos[:, 3:7].astype(np.float64))
         root = played.qpos[..., :3].astype(np.float64)
-        speed = metrics.late_speed(root, played.length, heading, rate=rate)
-        path_speed, turn = metrics.late_course(
-            root, rotations.yaw(played.qpos[..., 3:7].astype(np.float64)), played.length, rate=rate
-        )
         displacement = metrics.forward_displacement(root, played.length, heading, played.start_qpos[:, :3])
 
-        detail = slice(0, min(DETAILED, self.count))
+        detail = slice(0, DETAILED)
         length = played.length[detail]
+        speed = metrics.late_speed(root[:, detail], length, heading[detail], rate=rate)
+        yaw = rotations.yaw(played.qpos[:, detail, 3:7].astype(np.float64))
+        path_speed, turn = metrics.late_course(root[:, detail], yaw, length, rate=rate)
         joints = played.qpos[:, detail, 7:].astype(np.float64)
         ranges = metrics.window_ranges(joints, length, robot.sagittal_joints, rate=rate)
         expert = library.mean(
@@ -165,8 +233,10 @@ class Evaluator:
         late = metrics.summarise(speed)
         own_speed = [planar_speed(clip) for clip in library.clips]
         own_turn = np.array([turning(clip) for clip in library.clips])
+        turns = abs(own_turn[played.clip[detail]]) > metrics.TURNS
         return Evaluation(
-            episodes=self.count,
+            noise=self.noise,
+            episodes=len(played.length),
             falls=int(played.fell.sum()),
             mean_length=float(played.length.mean()),
             late_speed=late.mean,
@@ -177,7 +247,7 @@ class Evaluator:
             excursion=excursion.mean,
             excursion_n=excursion.n,
             amplitude_mae=metrics.summarise(metrics.amplitude_mae(ranges, expert)).mean,
-            sinkhorn=self._sinkhorn(played, detail),
+            discrepancy=self._discrepancy(played, detail),
             contact_foot_speed=metrics.summarise(metrics.contact_foot_speed(feet, contact, length, rate=rate)).mean,
             imbalance=metrics.summarise(metrics.left_right_imbalance(ranges)).mean,
             displacement=metrics.summarise(displacement).mean,
@@ -186,20 +256,21 @@ class Evaluator:
             demonstration_turning=float(library.mean(abs(own_turn))),
             joint_ranges=tuple(np.degrees(_finite_mean(ranges)).round(2).tolist()),
             expert_ranges=tuple(np.degrees(expert).round(2).tolist()),
-            motions=self._shares(
-                played, np.where(abs(own_turn[played.clip]) > metrics.TURNS, path_speed, speed), own_speed
-            ),
+            starts=played.starts,
+            motions=self._shares(played, np.where(turns, path_speed, speed), own_speed),
         )
 
     def _shares(self, played: Episodes, speed: np.ndarray, own_speed: list[float]) -> tuple[Share, ...]:
+        """Shares of the demonstrations, given the late speeds of the detailed episodes."""
         clips = self.trainer.library.clips
         if len(clips) == 1 or self.trainer.config.env.reset == "fixed":
             return ()
         shares = []
         for i, clip in enumerate(clips):
             mine = played.clip == i
-            late = metrics.summarise(speed[mine]).mean
-            shares.append(Share(clip.name, int(mine.sum()), int(played.fell[mine].sum()), late, own_speed[i]))
+            late = metrics.summarise(speed[mine[: len(speed)]])
+            falls = int(played.fell[mine].sum())
+            shares.append(Share(clip.name, int(mine.sum()), falls, late.mean, late.n, own_speed[i]))
         return tuple(shares)
 
     def _feet(self, qpos: jax.Array) -> tuple[np.ndarray, np.ndarray]:
@@ -213,10 +284,9 @@ class Evaluator:
         contact = np.stack([np.asarray(heights[..., robot.sole_body == f].min(-1)) for f in feet], axis=-1)
         return position, contact < CONTACT_HEIGHT
 
-    def _sinkhorn(self, played: Episodes, detail: slice) -> float:
-        """Debiased Sinkhorn discrepancy between evaluation and expert windows in the fixed features."""
-        trainer = self.trainer
-        horizon = trainer.env.horizon
+    def _discrepancy(self, played: Episodes, detail: slice) -> float:
+        """Debiased Sinkhorn discrepancy between evaluation and expert windows in the paper's features."""
+        horizon = self.trainer.env.horizon
         qpos, qvel = jnp.asarray(played.qpos[:, detail]), jnp.asarray(played.qvel[:, detail])
         frames = self._frames(qpos, qvel)
         frames = np.concatenate([np.swapaxes(played.history[detail], 0, 1), np.asarray(frames)])  # [H + T, n, F]
@@ -224,12 +294,8 @@ class Evaluator:
         # Evenly spaced samples in a fixed shuffled order: the same windows for the same lengths.
         pick = np.random.default_rng(0).permutation(len(steps))[:WINDOWS]
         rows = steps[pick, None] + 1 + np.arange(horizon)
-        evaluated = trainer.feature_map(jnp.asarray(frames[rows, episodes[pick, None]]))
-        rows = np.arange(0, len(trainer.expert.windows), max(1, len(trainer.expert.windows) // WINDOWS))
-        if trainer.expert.share is not None:
-            rows = trainer.expert.bank_rows(jax.random.PRNGKey(0), WINDOWS)
-        expert = trainer.expert.windows[rows]
-        return float(discrepancy(evaluated, expert, trainer.feature_map.dimension))
+        evaluated = self._feature_map(jnp.asarray(frames[rows, episodes[pick, None]]))
+        return float(discrepancy(evaluated, self._expert, self._feature_map.dimension))
 
 
 @jax.jit
@@ -259,11 +325,6 @@ def turning(clip: MotionClip) -> float:
     return float(yaw[-1] - yaw[0]) / clip.duration
 
 
-def _defined(values: dict) -> dict:
-    """Null in place of what is not defined, for JSON."""
-    return {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in values.items()}
-
-
 def _finite_mean(ranges: np.ndarray) -> np.ndarray:
     """Mean of ``ranges [W, N, 6]`` over windows and episodes that have them, ``[6]``."""
     flat = ranges.reshape(-1, ranges.shape[-1])
@@ -276,18 +337,23 @@ def table(evaluation: Evaluation) -> str:
     e = evaluation
     rows = [
         ("mean episode length", f"{e.mean_length:.1f}", "steps"),
-        ("falls", f"{e.falls} of {e.episodes}", ""),
+        ("falls", f"{e.falls} of {e.episodes}", f"joint noise of {e.noise:g} rad at the start, as in all below"),
         ("late forward speed", f"{e.late_speed:.3f} ± {e.late_deviation:.3f}", f"m/s, n = {e.late_n}"),
         ("speed along its own heading", f"{e.path_speed:.3f}", f"m/s, turning at {e.turn:+.3f} rad/s"),
         ("demonstration's speed", f"{e.demonstration_speed:.3f}", f"m/s, turning at {e.demonstration_turn:+.3f} rad/s"),
         ("excursion", f"{e.excursion:.3f}", f"of the expert's, n = {e.excursion_n}"),
         ("amplitude MAE", f"{e.amplitude_mae:.2f}", "degrees"),
-        ("Sinkhorn discrepancy", f"{e.sinkhorn:.4f}", ""),
+        ("Sinkhorn discrepancy", f"{e.discrepancy:.4f}", "in the paper's features"),
         ("foot speed in contact", f"{e.contact_foot_speed:.3f}", "m/s"),
         ("left-right imbalance", f"{e.imbalance:.3f}", ""),
         ("forward displacement", f"{e.displacement:.2f}", "m"),
         ("leg ranges (hip, knee, ankle; L, R)", " ".join(f"{r:.0f}" for r in e.joint_ranges), "degrees"),
         ("expert's leg ranges", " ".join(f"{r:.0f}" for r in e.expert_ranges), "degrees"),
+    ]
+    rows += [
+        (f"falls at joint noise of {start.noise:g} rad", f"{start.falls} of {start.episodes}", "")
+        for start in e.starts
+        if start.noise != e.noise
     ]
     rows += [
         (

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from fmpjax import config as configuration
-from fmpjax import diagnose, memory, motion, policy, robots, sharding, shell
+from fmpjax import diagnose, evaluate, jsons, memory, motion, policy, robots, sharding, shell
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import Config
 from fmpjax.errors import UserError, out_of_memory
@@ -95,7 +95,7 @@ class Run:
             run.folder.mkdir(parents=True, exist_ok=True)
             for clip, path in zip(library.clips, run._demonstration_files(len(library.clips)), strict=True):
                 motion.save(clip, path)
-            write(run.folder / "provenance.json", json.dumps(provenance(), indent=1))
+            write(run.folder / "provenance.json", jsons.dumps(provenance()))
             run._trainer = Trainer(config, run._demonstration(config))
             # Last: a folder with a configuration is a run, and what cannot be trained is none.
             write(run.folder / "config.json", configuration.to_json(config))
@@ -130,7 +130,7 @@ class Run:
         made, here = self.provenance(), provenance()
         again = {key: here[key] for key in ("command", "date", "commit", "uncommitted_changes", "device")}
         made |= {"resumed": [*made.get("resumed", []), again]}
-        write(self.folder / "provenance.json", json.dumps(made, indent=1))
+        write(self.folder / "provenance.json", jsons.dumps(made))
 
     def provenance(self) -> dict[str, Any]:
         """What ``provenance.json`` says.
@@ -242,7 +242,7 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
     compiling = time.monotonic() - compile_began
     progress.note(f"compiled in {compiling:.0f} s")
     spare = compiling  # s that the last evaluation and save may take
-    names = [f"eval/{name}" for name in _evaluation_names()]
+    names = [f"eval/{name}" for name in evaluate.names(config)]
     metric_names = sorted(jax.eval_shape(trainer.iteration, states[0])[1])
     logs = [MetricsLog(run.folder, [*metric_names, *names], done, keep=primary) for run in group]
     milestones = _milestones(config)
@@ -453,7 +453,7 @@ def export(run: Run, out: Path) -> list[Path]:
     # Where the demonstration and the run lay is this machine's affair; their names are everybody's.
     places = [*(name for name, _ in run.motions(run.config)), run.folder.resolve(), run.folder]
     texts = {"config.json": (run.folder / "config.json").read_text().rstrip("\n")}
-    texts["provenance.json"] = json.dumps(run.provenance(), indent=1)
+    texts["provenance.json"] = jsons.dumps(run.provenance())
     texts = {n: without_places(text, places) for n, text in texts.items()}
     if (out / "config.json").exists() and (out / "config.json").read_text().rstrip("\n") != texts["config.json"]:
         raise UserError(f"{out} holds results of another configuration: expected a new folder or this run's own")
@@ -531,10 +531,6 @@ def machine() -> str:
     """The device that JAX computes on, in words."""
     device = jax.devices()[0]
     return f"{cores()} CPU cores" if device.platform == "cpu" else device.device_kind
-
-
-def _evaluation_names() -> list[str]:
-    return [f.name for f in dataclasses.fields(Evaluation) if "tuple" not in str(f.type)] + ["quality"]
 
 
 def _milestones(config: Config) -> list[int]:

@@ -209,10 +209,10 @@ def test_a_cell_that_fails_is_named_after_the_others_ran(tmp_path):
 # --- tables ----------------------------------------------------------------------------------------------------------
 
 
-def row(method, seed, speed, reset="dataset", variant=""):
+def row(method, seed, speed, reset="dataset", variant="", **further):
     figures = {"mean_length": 490.0, "falls": 5.0, "late_speed": speed, "excursion": 1.0, "amplitude_mae": 9.0,
-               "sinkhorn": 0.2}  # fmt: skip
-    return table.Row(f"{method}-{reset}-{seed}", method, reset, variant, seed, 1000, 60.0, figures)
+               "discrepancy": 0.2}  # fmt: skip
+    return table.Row(f"{method}-{reset}-{seed}", method, reset, variant, seed, 1000, 60.0, figures | further)
 
 
 def test_interval_is_student_s():
@@ -228,7 +228,9 @@ def test_table_has_the_paper_beside_ours():
     lines = table.markdown([row("fmp", 0, 0.6), row("fmp", 1, 0.7), row("amp", 0, math.nan)]).splitlines()
     assert len(lines) == 2 + 4
     assert lines[2].startswith("| dataset | FMP | 2 | 490.0 ± 0.0 | 5.0 ± 0.0 | 0.650 ± 0.635 |")
-    assert lines[3].startswith("| dataset | FMP, the paper's | 1 | 500.0 | 0.0 | 0.727 | 1.119 | 9.95 | 0.159 |")
+    assert lines[3].startswith(
+        "| dataset | FMP, the paper's | 1 | 500.0 | 0.0 (n = 1024) | 0.727 (n = 64) | 1.119 | 9.95 | 0.159 |"
+    )
     assert lines[4].startswith("| dataset | AMP | 1 | 490.0 | 5.0 | – |")
     # Of whom a figure is the mean, where not of all.
     lines = table.markdown([row("fmp", i, v) for i, v in enumerate((0.88, math.nan, 0.9))]).splitlines()
@@ -243,3 +245,46 @@ def test_table_has_the_paper_beside_ours():
 def test_variants_have_rows_of_their_own():
     lines = table.markdown([row("fmp", 0, 0.6, variant="short"), row("fmp", 0, 0.7, variant="long")]).splitlines()
     assert [line.split("|")[2].strip() for line in lines[2:]] == ["FMP, short", "FMP, long"]
+
+
+def test_falls_stand_at_every_size_of_noise_with_their_episodes():
+    """An old evaluation beside a new one: it has no falls at a size, and no figure in the paper's features."""
+    sized = {"noise": 1e-3, "episodes": 256.0, "late_n": 64.0, "falls_at_0": 0.0, "episodes_at_0": 1.0,
+             "falls_at_0.01": 50.0, "episodes_at_0.01": 86.0}  # fmt: skip
+    new = [row("fmp", seed, 0.6, "fixed", **sized) for seed in (0, 1)]
+    old = row("amp", 0, 0.5, "fixed", sinkhorn=0.1, episodes=256.0, late_n=256.0)
+    del old.figures["discrepancy"]
+    headings, body = table.lines([*new, old])
+    found = [dict(zip(headings, line, strict=True)) for line in body]
+    assert headings[3:8] == ["mean steps", "falls, %", "at 0 rad, %", "at 0.01 rad, %", "speed, m/s"]
+    assert found[0]["falls, %"] == "5.0 ± 0.0 (n = 512)" and found[0]["at 0 rad, %"] == "0.0 ± 0.0 (n = 2)"
+    assert found[0]["at 0.01 rad, %"] == "50.0 ± 0.0 (n = 172)" and found[0]["speed, m/s"] == "0.600 ± 0.000 (n = 128)"
+    assert found[1]["falls, %"] == "12.6 (n = 1024)" and found[1]["at 0 rad, %"] == "–"
+    assert found[2]["at 0.01 rad, %"] == found[2]["Sinkhorn"] == "–" and found[2]["speed, m/s"] == "0.500 (n = 256)"
+    now, before = table.notes([*new, old])
+    assert "all other figures of starts with 0.001 rad (fixed reset)" in now and "do not compare" in before
+    assert len(table.notes(new)) == len(table.notes([old])) == 1
+    assert "at 0.01 rad" not in table.markdown([old])
+
+
+def test_runs_of_earlier_versions_are_read(tmp_path):
+    """Falls become per cent of the episodes at their size; cells that an old file lacks or left empty are blank."""
+    (cell,) = cells.plan(cells.Specification(preset="smoke", methods=("fmp",), resets=("fixed",)))
+    run = tmp_path / cell.name
+    run.mkdir(parents=True)
+
+    def read(text):
+        (run / "metrics.csv").write_text("iteration,transitions,seconds,eval/quality,eval/episodes,eval/falls" + text)
+        return table.evaluations(cell, tmp_path)
+
+    (old,) = read(",eval/sinkhorn\n1,10,2.0,0.5,8,2,0.07\n")
+    assert old.figure("falls") == 25.0 and old.figures["sinkhorn"] == 0.07 and math.isnan(old.figure("discrepancy"))
+    before, new = read(",eval/falls_at_0.01,eval/episodes_at_0.01\n1,10,2.0,0.5,8,2,,\n2,20,4.0,0.5,8,2,3,4\n")
+    assert math.isnan(before.figure("falls_at_0.01")) and new.figure("falls_at_0.01") == 75.0
+    provenance = {"commit": "c", "uncommitted_changes": False, "date": "d", "device": "e"}
+    (run / "provenance.json").write_text(json.dumps(provenance))
+    table.write([cell], tmp_path)
+    assert "| 75.0 (n = 4) |" in (tmp_path / "table.md").read_text()
+    assert r"75.0 (n = 4) &" in (tmp_path / "table.tex").read_text()
+    results = json.loads((tmp_path / "results.json").read_text())["evaluations"]
+    assert results[0]["falls_at_0.01"] is None and results[1]["falls_at_0.01"] == 75.0

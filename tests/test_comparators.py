@@ -241,7 +241,7 @@ def test_amp_normaliser_weighs_agent_and_demonstration_alike():
 
 
 def test_amp_replay_fills_and_then_turns_over_slowly():
-    """400 places: two rollouts of 150 go in whole, of the third the 100 that fit, then 10 a rollout, oldest first."""
+    """400 places: three rollouts of 150 go in whole, the last 50 over the oldest, then 10 a rollout, oldest first."""
     replay = amp.Replay(jnp.zeros((400, 1), jnp.float16), jnp.int32(0), jnp.int32(0))
     put = jax.jit(amp.store, static_argnums=2)
 
@@ -255,9 +255,9 @@ def test_amp_replay_fills_and_then_turns_over_slowly():
     assert seen == [
         (150, 150, [150, 0, 0, 0, 0]),
         (300, 300, [150, 150, 0, 0, 0]),
-        (400, 0, [150, 150, 100, 0, 0]),
-        (400, 10, [140, 150, 100, 10, 0]),
-        (400, 20, [130, 150, 100, 10, 10]),
+        (400, 50, [100, 150, 150, 0, 0]),
+        (400, 60, [90, 150, 150, 10, 0]),
+        (400, 70, [80, 150, 150, 10, 10]),
     ]
 
 

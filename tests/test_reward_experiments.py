@@ -207,14 +207,39 @@ def test_features_go_back_to_units(trainer):
 
 @pytest.mark.slow
 def test_barycentric_rewards_are_made_anew(trainer):
-    figures = barycenter.measure(trainer, 64, 0)
+    figures, other = barycenter.measure(trainer, 64, (0, 1))[0.1]
+    assert figures["retention"] != other["retention"] and figures["bank"] == other["bank"]
     assert figures["reward_difference"] < barycenter.REWARD_TOLERANCE and figures["exponent_difference"] < 1e-3
     assert 0 < figures["retention"] < 1 and 1 <= figures["effective_atoms"] <= figures["bank"] == 16
     assert figures["retention"] == pytest.approx(figures["target_leg_velocity"] / figures["matched_leg_velocity"])
     # The bundled walk goes at 0.86 m/s.
     assert figures["bank_speed"] == pytest.approx(0.86, abs=0.1)
     with pytest.raises(UserError, match="the first rollout has 256 windows: expected at least 300"):
-        barycenter.measure(trainer, 300, 0)
+        barycenter.measure(trainer, 300, (0,))
+
+
+def test_barycentric_figures_are_means_over_draws():
+    """Retentions of 0.1 and 0.3: 0.2, deviation 0.1 sqrt 2. Of what must agree the largest difference is kept."""
+
+    def draw(retention, difference):
+        names = ("target_leg_velocity", "matched_leg_velocity", "effective_atoms", "target_speed", "bank_speed", "bank")
+        figures = dict.fromkeys((*names, "exponent_difference"), 2.0) | {"effective_atoms_quantiles": [0.0, retention]}
+        return figures | {"retention": retention, "reward_difference": difference}
+
+    found = barycenter.over_draws([draw(0.1, 1e-7), draw(0.3, 2e-8)])
+    assert found["retention"] == pytest.approx(0.2) and found["deviation"]["retention"] == pytest.approx(
+        0.1414, abs=1e-4
+    )
+    assert found["reward_difference"] == 1e-7 and found["effective_atoms_quantiles"] == pytest.approx([0.0, 0.2])
+    assert barycenter.over_draws([draw(0.1, 1e-7)])["deviation"] == {}
+    record = {"settings": {"targets": 64, "draws": 2, "entropy": 0.1}, "resets": {"fixed": found}}
+    shown = barycenter.table(record | {"entropies": {"0.15": {"fixed": draw(0.05, 0.0)}}})
+    assert "means over 2 draws" in shown.caption
+    assert [line[:2] for line in shown.lines] == [
+        ["fixed reset", "0.200 ± 0.141"], ["fixed reset, entropy 0.15", "0.050"], ["fixed reset, the paper's", "0.103"],
+    ]  # fmt: skip
+    # A result of an earlier version is of one draw.
+    assert barycenter.table({"settings": {"targets": 64}, "resets": {"fixed": draw(0.2, 0.0)}}).lines[0][1] == "0.200"
 
 
 def test_curvature_is_its_closed_form():
@@ -260,6 +285,18 @@ def test_run_without_a_policy(refused, tmp_path):
 def test_place_that_cannot_be_written(refused, tmp_path):
     (tmp_path / "file").write_text("")
     assert "--out file/out cannot be written" in refused(curvature.main, "--out", "file/out")
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (("--draws", "0"), "--draws is 0: expected at least 1"),
+        (("--entropies", "0.1", "-1"), "--entropies has -1: expected numbers above 0"),
+        (("--entropies", "nan"), "--entropies has nan: expected numbers above 0"),
+    ],
+)
+def test_bad_draws_and_entropies(refused, option, message):
+    assert message in refused(barycenter.main, "--out", "out", *option)
 
 
 def test_history_longer_than_the_time_since_the_reset():

@@ -1,12 +1,12 @@
 """What averaging matched successors does to the motion in them (section V-D of the paper).
 
 The barycentric baseline's targets in the first rollout of an untrained policy, under either reset: how much of the
-legs' velocity the average keeps, how many expert windows it is over, how fast it goes. Run as
-``python -m fmpjax.experiments.barycenter --out FOLDER``.
+legs' velocity the average keeps, how many expert windows it is over, how fast it goes. A draw is one seed's policy,
+starts and banks; figures are means over draws. Run as ``python -m fmpjax.experiments.barycenter --out FOLDER``.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,6 +19,7 @@ from fmpjax.errors import UserError
 from fmpjax.experiments import results
 from fmpjax.experiments.results import Table, Verdict, number
 from fmpjax.features import FeatureMap
+from fmpjax.priors.barycentric import BarycentricState
 from fmpjax.shell import default
 from fmpjax.train import Trainer
 from fmpjax.viz import panels
@@ -28,6 +29,7 @@ NAME = "barycenter"
 RESETS = ("dataset", "fixed")
 TARGETS = 2048  # of the first rollout [P]
 REWARD_TOLERANCE = 1e-6  # within which rewards made anew must be the method's own
+_SPREAD = ("retention", "target_leg_velocity", "effective_atoms", "target_speed")  # figures with a deviation
 QUANTILES = np.linspace(0.0, 1.0, 41)
 COLOURS = {"dataset": "#2a6fb0", "fixed": "#c8553d"}
 PAPER = {
@@ -52,24 +54,64 @@ def retention(probability: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray
     return np.linalg.norm(probability @ velocity, axis=-1), probability @ np.linalg.norm(velocity, axis=-1)
 
 
-def measure(trainer: Trainer, targets: int, seed: int) -> dict[str, Any]:
-    """Targets and rewards of the barycentric prior in the first rollout of an untrained policy.
+def measure(
+    trainer: Trainer, targets: int, seeds: Sequence[int], fractions: Sequence[float] = ()
+) -> dict[float, list[dict[str, Any]]]:
+    """Targets and rewards of the barycentric prior in the first rollout of an untrained policy, one of each seed.
 
-    All is made anew in float64 from the windows and the prior's dual: matching, targets and rewards.
+    Args:
+      trainer: with a barycentric prior.
+      targets: of each rollout.
+      seeds: of the draws.
+      fractions: entropies over the median cost to match at, the configuration's alone by default.
+
+    Returns:
+      The figures of each draw, by fraction.
 
     Raises:
       UserError: fewer windows than targets.
     """
-    count = trainer.config.transitions_per_iteration
-    if count < targets:
-        raise UserError(f"the first rollout has {count} windows: expected at least {targets}, one a target")
-    state = trainer.init(seed)
-    _, rollout_key, prior_key, _ = jax.random.split(state.key, 4)
-    env, steps = trainer.env, trainer.config.ppo.rollout_steps
-    _, record = jax.jit(lambda s, k: env.rollout(s.env, trainer.ppo.act(s.ppo), k, steps))(state, rollout_key)
-    windows = trainer.feature_map(env.frame_table(state.env, record)[record.window])
-    valid = np.flatnonzero(~np.asarray(record.nonfinite))
-    prior, reward, _ = jax.jit(trainer.prior.update)(state.prior, priors.Rollout(windows, ~record.nonfinite), prior_key)
+    config = trainer.config
+    if config.transitions_per_iteration < targets:
+        raise UserError(
+            f"the first rollout has {config.transitions_per_iteration} windows: expected at least {targets}, "
+            "one a target"
+        )
+    updates = {
+        fraction: jax.jit(_prior_at(trainer, fraction).update)
+        for fraction in fractions or [config.prior.epsilon_fraction]
+    }
+
+    @jax.jit
+    def roll(state, key):
+        _, record = trainer.env.rollout(state.env, trainer.ppo.act(state.ppo), key, config.ppo.rollout_steps)
+        windows = trainer.feature_map(trainer.env.frame_table(state.env, record)[record.window])
+        return priors.Rollout(windows, ~record.nonfinite)
+
+    draws: dict[float, list[dict[str, Any]]] = {fraction: [] for fraction in updates}
+    for seed in seeds:
+        state = trainer.init(seed)
+        _, rollout_key, prior_key, _ = jax.random.split(state.key, 4)
+        rollout = roll(state, rollout_key)
+        for fraction, update in updates.items():
+            prior, reward, _ = update(state.prior, rollout, prior_key)
+            draws[fraction].append(_figures(trainer, prior, rollout, reward, targets, seed))
+    return draws
+
+
+def _prior_at(trainer: Trainer, fraction: float) -> priors.MotionPrior:
+    """The trainer's prior with another entropy."""
+    config = trainer.config
+    changed = dataclasses.replace(config, prior=dataclasses.replace(config.prior, epsilon_fraction=fraction))
+    return priors.make(config.method, trainer.prior_expert, changed)
+
+
+def _figures(
+    trainer: Trainer, prior: BarycentricState, rollout: priors.Rollout, reward: jax.Array, targets: int, seed: int
+) -> dict[str, Any]:
+    """Figures of one draw, all made anew in float64 from the windows and the prior's dual."""
+    env, windows = trainer.env, rollout.features
+    valid = np.flatnonzero(np.asarray(rollout.valid))
     chosen = np.random.default_rng(seed).choice(valid, targets, replace=False)
     x = np.asarray(windows, np.float64).reshape(-1, windows.shape[-1])[chosen]
     frames = x.reshape(targets, env.horizon, -1)
@@ -112,22 +154,46 @@ def measure(trainer: Trainer, targets: int, seed: int) -> dict[str, Any]:
     }
 
 
+def over_draws(draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over draws, quantiles included; of what must agree the largest difference; and standard deviations."""
+    figures = {}
+    for name in draws[0]:
+        values = np.array([draw[name] for draw in draws])
+        figures[name] = (values.max(0) if name.endswith("_difference") else values.mean(0)).tolist()
+    spread = {name: float(np.std([draw[name] for draw in draws], ddof=1)) for name in _SPREAD if len(draws) > 1}
+    return figures | {"deviation": spread}
+
+
 def table(record: Mapping[str, Any]) -> Table:
     """The attenuation's figures, the paper's beside ours."""
 
-    def line(name: str, f: Mapping[str, float]) -> list[str]:
+    def figure(f: Mapping[str, Any], name: str, digits: int = 3) -> str:
+        deviation = f.get("deviation", {}).get(name)
+        return number(f.get(name), digits) + ("" if deviation is None else f" ± {number(deviation, digits)}")
+
+    def line(name: str, f: Mapping[str, Any]) -> list[str]:
         return [
-            name, number(f["retention"]), number(f.get("target_leg_velocity")), number(f["effective_atoms"], 1),
-            number(f["target_speed"]), f"{f['reward_difference']:.1e}",
+            name, figure(f, "retention"), figure(f, "target_leg_velocity"), figure(f, "effective_atoms", 1),
+            figure(f, "target_speed"), f"{f['reward_difference']:.1e}",
         ]  # fmt: skip
 
     lines = []
     for reset, figures in record["resets"].items():
-        lines += [line(f"{reset} reset", figures), line(f"{reset} reset, the paper's", PAPER[reset])]
+        lines.append(line(f"{reset} reset", figures))
+        for fraction, others in record.get("entropies", {}).items():
+            lines.append(line(f"{reset} reset, entropy {fraction}", others[reset]))
+        lines.append(line(f"{reset} reset, the paper's", PAPER[reset]))
     headings = [
         "targets", "norm retention", "legs, rad/s", "effective atoms", "forward speed, m/s", "rewards differ by"
     ]  # fmt: skip
-    return Table(f"{record['settings']['targets']:,} barycentric targets of the first rollout", headings, lines)
+    settings = record["settings"]
+    draws = settings.get("draws", 1)
+    caption = f"{settings['targets']:,} barycentric targets of the first rollout"
+    if draws > 1:
+        caption += f"; means over {draws} draws, with the standard deviation between them"
+    if record.get("entropies"):
+        caption += f"; entropies over the median cost, {settings['entropy']:g} where none is named"
+    return Table(caption, headings, lines)
 
 
 def verdicts(record: Mapping[str, Any]) -> list[Verdict]:
@@ -186,6 +252,8 @@ def main(
     motion: str = "walk",
     frames: Annotated[str, default("all")] = "",
     seed: int = 0,
+    draws: int = 8,
+    entropies: tuple[float, ...] = (0.12, 0.15),
     smoke: bool = False,
 ) -> None:
     """Reconstruct the barycentric baseline's first targets under either reset.
@@ -195,28 +263,45 @@ def main(
       preset: of features, robot and untrained policy; with 1,024 environments whatever it says.
       motion: a bundled motion's name or a file.
       frames: source rows "first:last" of the motion.
-      seed: of everything random.
+      seed: of everything random in the first draw; the next has the next seed.
+      draws: first rollouts, each with a policy, starts and banks of its own.
+      entropies: further entropies over the median cost to match at, beside the preset's.
       smoke: the whole path, small.
     """
     from fmpjax import runs
 
-    count, targets = (16, 64) if smoke else (1024, TARGETS)
+    if draws < 1:
+        raise UserError(f"--draws is {draws}: expected at least 1")
+    for entropy in entropies:
+        if not 0 < entropy < np.inf:
+            raise UserError(f"--entropies has {entropy:g}: expected numbers above 0")
+    count, targets, draws = (16, 64, 2) if smoke else (1024, TARGETS, draws)
     results.check_folder(out)
     base = configuration.preset(
         preset, motion=motion, frames=frames, method="barycentric", seed=seed, **{"env.count": count}
     )
     clip = runs.load_motion(base)
-    resets = {}
+    own = base.prior.epsilon_fraction
+    fractions = list(dict.fromkeys([own, *entropies]))
+    found: dict[float, dict[str, Any]] = {fraction: {} for fraction in fractions}
+    scalars = []
     for reset in RESETS:
-        print(f"first rollout, {reset} reset ...", flush=True)
+        print(f"first rollouts, {reset} reset ...", flush=True)
         config = dataclasses.replace(base, env=dataclasses.replace(base.env, reset=reset))
-        resets[reset] = measure(Trainer(config, clip), targets, seed)
-    settings = {"preset": preset, "motion": Path(motion).name, "frames": frames, "seed": seed, "targets": targets}
-    record = {"settings": settings, "resets": resets}
-    scalars = [
-        {"reset": reset} | {k: v for k, v in figures.items() if not isinstance(v, list)}
-        for reset, figures in resets.items()
-    ]
+        seeds = range(seed, seed + draws)
+        for fraction, each in measure(Trainer(config, clip), targets, seeds, fractions).items():
+            found[fraction][reset] = over_draws(each)
+            scalars += [
+                {"reset": reset, "entropy": fraction, "seed": drawn}
+                | {k: v for k, v in figures.items() if not isinstance(v, list)}
+                for drawn, figures in zip(seeds, each, strict=True)
+            ]
+    settings = {
+        "preset": preset, "motion": Path(motion).name, "frames": frames, "seed": seed, "draws": draws,
+        "targets": targets, "entropy": own,
+    }  # fmt: skip
+    others = {f"{fraction:g}": found[fraction] for fraction in fractions if fraction != own}
+    record = {"settings": settings, "resets": found[own], "entropies": others}
     paths = results.save(out, NAME, record, scalars, (motion, out))
     paths.append(figure(record, out / f"{NAME}.png"))
     print(results.text(table(record)), end="\n\n")

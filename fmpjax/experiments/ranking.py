@@ -6,7 +6,6 @@ as ``python -m fmpjax.experiments.ranking --run RUN`` or, for the start of train
 """
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import features, priors
+from fmpjax import features, jsons, priors
 from fmpjax.experiments import histories, results
 from fmpjax.motion import MotionClip, resample
 from fmpjax.shell import default
@@ -133,7 +132,7 @@ def main(
     print(f"pool: {played.valid.size} windows, mean forward speed {played.speed:.3f} m/s")
     print(table(ranking))
     path.parent.mkdir(parents=True, exist_ok=True)
-    runs.write(path, json.dumps({"pool_speed": played.speed, "updates": updates, "windows": ranking}, indent=1))
+    runs.write(path, jsons.dumps({"pool_speed": played.speed, "updates": updates, "windows": ranking}))
     print(f"wrote {path}")
 
 

@@ -96,7 +96,8 @@ def _section(
 def _comparison(record: Mapping[str, Any]) -> tuple[Table, list[Verdict]]:
     final = table.final(record["evaluations"])
     headings, lines = table.lines(final)
-    caption = "Last evaluations; means over seeds, with their 95 % intervals where there are several"
+    caption = "Last evaluations; means over seeds, with their 95 % intervals where there are several."
+    caption = " ".join([caption, *table.notes(final)])
     named = [[f"{reset}: {method}", *cells] for reset, method, *cells in lines]
     return Table(caption, ["reset: method", *headings[2:]], named), table.verdicts(final)
 

@@ -1,14 +1,13 @@
 """What the reward-level experiments share on their way out: tables, verdicts, files, and the way in from the shell."""
 
 import csv
-import json
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fmpjax import shell
+from fmpjax import jsons, shell
 from fmpjax.errors import UserError
 from fmpjax.shell import Group
 
@@ -75,7 +74,7 @@ def save(
     from fmpjax import runs
 
     out.mkdir(parents=True, exist_ok=True)
-    written = json.dumps(_finite({"provenance": runs.provenance(), **record}), indent=1)
+    written = jsons.dumps({"provenance": runs.provenance(), **record})
     runs.write(out / f"{name}.json", runs.without_places(written, places))
     partial = out / f"{name}.csv.partial"
     with partial.open("w", newline="") as file:
@@ -91,15 +90,6 @@ def _cell(value: Any) -> Any:
     if not isinstance(value, float):
         return value
     return f"{value:.6g}" if math.isfinite(value) else ""
-
-
-def _finite(value: Any) -> Any:
-    """``value`` without NaN and infinity, which JSON does not have."""
-    if isinstance(value, Mapping):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def entry(main: Callable[..., Any] | Group, arguments: Sequence[str] | None = None) -> None:

@@ -8,7 +8,6 @@ the few updates of a rollout follow the transport they are fitted to, and which 
 
 import csv
 import dataclasses
-import json
 import time
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from fmpjax import features, physics, potential, ppo, priors, runs
+from fmpjax import features, jsons, physics, potential, ppo, priors, runs
 from fmpjax.config import Config, preset
 from fmpjax.evaluate import Evaluator
 from fmpjax.experiments import reference, results
@@ -371,9 +370,9 @@ def measure(
         )
         _write(out / "standing.csv", rows)
     settings = {"preset": preset_name, "motion": Path(motion).name, "frames": frames, "seed": seed, "set": changes}
-    evaluation = json.loads(Evaluator(trainer)(state.ppo).to_json())
+    evaluation = Evaluator(trainer)(state.ppo).record()
     record = {"settings": settings, "tracking": tracking, "evaluation": evaluation, "provenance": runs.provenance()}
-    runs.write(out / "standing.json", runs.without_places(json.dumps(record, indent=1), [motion]))
+    runs.write(out / "standing.json", runs.without_places(jsons.dumps(record), [motion]))
     print(f"wrote {out}/standing.csv and standing.json")
     print(f"wrote {figure(out / 'standing.png', (out,))}")
 

@@ -5,14 +5,13 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy import stats
 
-from fmpjax.config import FeatureConfig
 from fmpjax.experiments import results
 from fmpjax.experiments.cells import Cell
 from fmpjax.experiments.results import Verdict
@@ -27,30 +26,42 @@ TITLES = {
     "amp": "AMP",
     "barycentric": "Barycentric OT",
 }
-# Column, heading, digits.
-FIGURES = (
-    ("mean_length", "mean steps", 1),
-    ("falls", "falls, %", 1),
-    ("late_speed", "speed, m/s", 3),
-    ("excursion", "excursion", 3),
-    ("amplitude_mae", "amp. MAE, °", 2),
-    ("sinkhorn", "Sinkhorn", 3),
+
+
+class Column(NamedTuple):
+    """A column of Table I."""
+
+    name: str
+    heading: str
+    digits: int
+    episodes: str = ""  # the figure that says how many episodes are behind it
+
+
+COLUMNS = (
+    Column("mean_length", "mean steps", 1),
+    Column("falls", "falls, %", 1, "episodes"),
+    Column("late_speed", "speed, m/s", 3, "late_n"),
+    Column("excursion", "excursion", 3),
+    Column("amplitude_mae", "amp. MAE, °", 2),
+    Column("discrepancy", "Sinkhorn", 3),
 )
-# The paper's Table I: 50 M transitions, 1,024 episodes; falls as a share of them.
+_EPISODES = 1024  # of the paper's evaluations
+# The paper's Table I, after 50 M transitions: steps, falls, speed, excursion, MAE, Sinkhorn, late n.
 _PAPER = {
-    ("dataset", "fmp"): (500.0, 0, 0.727, 1.119, 9.95, 0.159),
-    ("dataset", "endpoint"): (500.0, 0, 0.571, 0.997, 9.44, 0.158),
-    ("dataset", "value"): (500.0, 0, 0.776, 1.089, 8.69, 0.186),
-    ("dataset", "bank16"): (500.0, 0, 0.518, 0.891, 9.25, 0.196),
-    ("dataset", "amp"): (498.8, 3, 0.478, 1.035, 9.37, 0.239),
-    ("dataset", "barycentric"): (499.3, 3, 0.000, 0.025, 38.44, 0.347),
-    ("fixed", "fmp"): (469.4, 129, 0.338, 0.754, 12.60, 0.285),
-    ("fixed", "endpoint"): (453.8, 243, 0.147, 0.703, 13.38, 0.285),
-    ("fixed", "value"): (451.6, 315, 0.047, 0.387, 25.23, 0.308),
-    ("fixed", "bank16"): (466.7, 196, -0.021, 0.667, 14.27, 0.526),
-    ("fixed", "amp"): (500.0, 0, 0.000, 0.027, 39.24, 0.424),
-    ("fixed", "barycentric"): (500.0, 0, 0.000, 0.144, 35.15, 0.557),
+    ("dataset", "fmp"): (500.0, 0, 0.727, 1.119, 9.95, 0.159, 64),
+    ("dataset", "endpoint"): (500.0, 0, 0.571, 0.997, 9.44, 0.158, 64),
+    ("dataset", "value"): (500.0, 0, 0.776, 1.089, 8.69, 0.186, 64),
+    ("dataset", "bank16"): (500.0, 0, 0.518, 0.891, 9.25, 0.196, 64),
+    ("dataset", "amp"): (498.8, 3, 0.478, 1.035, 9.37, 0.239, 64),
+    ("dataset", "barycentric"): (499.3, 3, 0.000, 0.025, 38.44, 0.347, 64),
+    ("fixed", "fmp"): (469.4, 129, 0.338, 0.754, 12.60, 0.285, 61),
+    ("fixed", "endpoint"): (453.8, 243, 0.147, 0.703, 13.38, 0.285, 64),
+    ("fixed", "value"): (451.6, 315, 0.047, 0.387, 25.23, 0.308, 63),
+    ("fixed", "bank16"): (466.7, 196, -0.021, 0.667, 14.27, 0.526, 62),
+    ("fixed", "amp"): (500.0, 0, 0.000, 0.027, 39.24, 0.424, 64),
+    ("fixed", "barycentric"): (500.0, 0, 0.000, 0.144, 35.15, 0.557, 64),
 }
+_SIZED = "falls_at_"  # and the size of the perturbation at the start, rad
 
 
 def title(method: str, variant: str = "") -> str:
@@ -71,6 +82,10 @@ class Row:
     seconds: float  # of training
     figures: dict[str, float]
 
+    def figure(self, name: str) -> float:
+        """One of the figures; NaN where the evaluation, of an earlier version, has no such one."""
+        return self.figures.get(name, math.nan)
+
 
 def evaluations(cell: Cell, folder: Path) -> list[Row]:
     """All evaluations of a cell's run, in their order; falls in per cent of the episodes."""
@@ -79,7 +94,8 @@ def evaluations(cell: Cell, folder: Path) -> list[Row]:
         if not line.get("eval/quality"):
             continue
         figures = {k.removeprefix("eval/"): float(v or "nan") for k, v in line.items() if k.startswith("eval/")}
-        figures["falls"] *= 100.0 / figures["episodes"]
+        for name in [name for name in figures if name == "falls" or name.startswith(_SIZED)]:
+            figures[name] *= 100.0 / figures[name.replace("falls", "episodes")]
         config = cell.config
         rows.append(
             Row(
@@ -114,31 +130,47 @@ def _number(value: float, digits: int, half: float = math.nan) -> str:
     return f"{value:.{digits}f}" + ("" if math.isnan(half) else f" ± {half:.{digits}f}")
 
 
-def _paper(reset: str, method: str) -> list[float]:
-    length, falls, *rest = _PAPER[reset, method]
-    return [length, 100.0 * falls / 1024, *rest]
+def _paper(reset: str, method: str) -> Row:
+    length, falls, speed, excursion, mae, discrepancy, late = _PAPER[reset, method]
+    figures = {
+        "mean_length": length, "falls": 100.0 * falls / _EPISODES, "episodes": _EPISODES, "late_speed": speed,
+        "late_n": late, "excursion": excursion, "amplitude_mae": mae, "discrepancy": discrepancy,
+    }  # fmt: skip
+    return Row("", method, reset, "", 0, 50_003_968, math.nan, figures)
+
+
+def _sizes(rows: Iterable[Row]) -> list[float]:
+    """Sizes of perturbation at which the evaluations count falls, rad."""
+    return sorted({float(name.removeprefix(_SIZED)) for row in rows for name in row.figures if name.startswith(_SIZED)})
 
 
 def lines(final: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Headings and lines of Table I, the paper's beside ours."""
-    headings = ["reset", "method", "seeds", *(heading for _, heading, _ in FIGURES), "training, min"]
+    """Headings and lines of Table I, the paper's beside ours; falls at every size of perturbation that a line has."""
+    at_size = [Column(f"{_SIZED}{size:g}", f"at {size:g} rad, %", 1, f"episodes_at_{size:g}") for size in _sizes(final)]
+    columns = [*COLUMNS[:2], *at_size, *COLUMNS[2:]]
+    headings = ["reset", "method", "seeds", *(column.heading for column in columns), "training, min"]
     body = []
     for (reset, method, variant), rows in _groups(final).items():
-        ours = [_cell([r.figures[k] for r in rows], digits) for k, _, digits in FIGURES]
         minutes = np.mean([r.seconds for r in rows]) / 60
         name = title(method, variant)
+        ours = [_cell(rows, column) for column in columns]
         body.append([reset, name, str(len(rows)), *ours, f"{minutes:.0f}"])
         if not variant:
-            theirs = [_number(v, d) for v, (_, _, d) in zip(_paper(reset, method), FIGURES, strict=True)]
+            theirs = [_cell([_paper(reset, method)], column) for column in columns]
             body.append([reset, f"{name}, the paper's", "1", *theirs, ""])
     return headings, body
 
 
-def _cell(values: Sequence[float], digits: int) -> str:
-    """Mean and interval, and of how many seeds where some have no such figure."""
+def _cell(rows: Sequence[Row], column: Column) -> str:
+    """Mean and interval, the episodes behind them, and of how many seeds where some have no such figure."""
+    values = [row.figure(column.name) for row in rows]
     mean, half = interval(values)
-    defined = sum(map(math.isfinite, values))
-    return _number(mean, digits, half) + (f" ({defined} of {len(values)})" if 0 < defined < len(values) else "")
+    text = _number(mean, column.digits, half)
+    defined = [row for row, value in zip(rows, values, strict=True) if math.isfinite(value)]
+    counts = [row.figure(column.episodes) for row in defined] if column.episodes else []
+    if counts and all(map(math.isfinite, counts)):
+        text += f" (n = {sum(counts):.0f})"
+    return text + (f" ({len(defined)} of {len(rows)})" if 0 < len(defined) < len(rows) else "")
 
 
 def markdown(final: Sequence[Row]) -> str:
@@ -183,11 +215,11 @@ def curves(rows: Sequence[Row], paths: Sequence[Path]) -> None:
                 for seed in sorted({r.seed for r in chosen}):
                     mine = [r for r in chosen if r.seed == seed]
                     panel.plot(
-                        [r.transitions / 1e6 for r in mine], [r.figures[key] for r in mine],
+                        [r.transitions / 1e6 for r in mine], [r.figure(key) for r in mine],
                         color=f"C{index}", linewidth=0.7, alpha=0.5,
                     )  # fmt: skip
                 stops = sorted({r.transitions for r in chosen})
-                means = [interval(r.figures[key] for r in chosen if r.transitions == stop)[0] for stop in stops]
+                means = [interval(r.figure(key) for r in chosen if r.transitions == stop)[0] for stop in stops]
                 (handles[name],) = panel.plot(
                     np.array(stops) / 1e6, means, color=f"C{index}", linewidth=1.8, marker="o", markersize=3
                 )
@@ -211,23 +243,33 @@ def write(cells: Sequence[Cell], folder: Path, places: Iterable[Path | str] = ()
     # The cells may have been trained by other versions than the one that writes this.
     runs = {cell.name: _origin(folder / cell.name / "provenance.json") for cell in cells}
     results.save(folder, "results", {"runs": runs, "evaluations": flat}, flat, {folder, *places, *motions})
-    (folder / "table.md").write_text("\n\n".join([markdown(final), *_cautions(cells)]) + "\n")
+    (folder / "table.md").write_text("\n\n".join([markdown(final), *notes(final)]) + "\n")
     (folder / "table.tex").write_text(latex(final) + "\n")
     curves(rows, [folder / "curves.png", folder / "curves.pdf"])
     return [folder / n for n in ("results.csv", "results.json", "table.md", "table.tex", "curves.png", "curves.pdf")]
 
 
-def _cautions(cells: Sequence[Cell]) -> list[str]:
-    """What the table's reader must know of its columns."""
-    paper = FeatureConfig()
-    floors = {(c.config.features.deviation_floor, c.config.features.angular_velocity_floor) for c in cells}
-    others = floors - {(paper.deviation_floor, paper.angular_velocity_floor)}
-    return [
-        f"Sinkhorn discrepancies are in the run's own features, whose deviations are floored at {floor:g}, those of "
-        f"angular velocities at {angular:g} rad/s (preset `paper`: {paper.deviation_floor:g}). The paper's figures in "
-        "that column stand in other units."
-        for floor, angular in sorted(others)
-    ]
+def notes(final: Sequence[Row]) -> list[str]:
+    """What the table's reader must know of its figures."""
+    sizes: dict[str, set[float]] = {}
+    for row in final:
+        if math.isfinite(row.figure("noise")):
+            sizes.setdefault(row.reset, set()).add(row.figure("noise"))
+    each = [f"{', '.join(f'{size:g}' for size in sorted(sizes[reset]))} rad ({reset} reset)" for reset in sizes]
+    found = []
+    if sizes:
+        found.append(
+            "Falls at a size are of starts with joint noise of that deviation, all other figures of starts with "
+            f"{' and '.join(each)}. n counts the episodes of all seeds; late speeds are of the first 64 of an "
+            "evaluation, as the paper's."
+        )
+    if any(math.isnan(row.figure("noise")) for row in final):
+        found.append(
+            "Evaluations by earlier versions are among these. Their starts are not perturbed, so that from the fixed "
+            "pose all their episodes are one; their late speeds are of all episodes; their Sinkhorn discrepancies, in "
+            "the run's own features, do not compare with the paper's and are left out."
+        )
+    return found
 
 
 def _origin(path: Path) -> dict[str, Any]:

@@ -89,19 +89,18 @@ def update_normalizer(state: Normalizer, agent: jax.Array, demonstration: jax.Ar
 
 
 def store(replay: Replay, windows: jax.Array, new: int, key: jax.Array) -> Replay:
-    """Replay with windows ``[n, D]`` put in: all until it is full, then ``new`` random ones for the oldest."""
+    """Replay with windows ``[n, D]`` put in: all until it is full, then ``new`` random ones; the oldest make room."""
     size = len(replay.windows)
     shuffled = jax.random.permutation(key, windows).astype(replay.windows.dtype)[:size]
     order = jnp.arange(len(shuffled))
     filling = replay.count < size
-    slots = replay.head + order
-    # Where it is filling, what does not fit is left out; rows sent to `size` are dropped.
-    rows = jnp.where(filling, jnp.minimum(slots, size), jnp.where(order < new, slots % size, size))
-    stored = jnp.where(filling, jnp.minimum(len(shuffled), size - replay.head), min(new, len(shuffled)))
+    # Rows sent to `size` are dropped.
+    rows = jnp.where(filling | (order < new), (replay.head + order) % size, size)
+    stored = jnp.where(filling, len(shuffled), min(new, len(shuffled)))
     return Replay(
         replay.windows.at[rows].set(shuffled, mode="drop"),
         ((replay.head + stored) % size).astype(jnp.int32),
-        jnp.minimum(replay.count + jnp.where(filling, stored, 0), size).astype(jnp.int32),
+        jnp.minimum(replay.count + stored, size).astype(jnp.int32),
     )
 
 
