@@ -90,7 +90,7 @@ def made(tmp_path):
         (["--set", "env.count=1.5"], ["env.count", "'1.5'", "int"]),
         (["--set", "env.count=-4"], ["env.count is -4"]),
         (["--set", "ppo.orthogonal=maybe"], ["ppo.orthogonal", "'maybe'", "bool"]),
-        (["--set", "ppo.learning_rate=nan"], ["ppo.learning_rate is nan"]),
+        (["--set", "ppo.learning_rate=nan"], ["ppo.learning_rate is 'nan'"]),
         (["--set", "ppo.actor_batch=5"], ["ppo.actor_batch is 5", "divisor"]),
         (["--resume"], ["--run"]),
     ],

