@@ -153,7 +153,7 @@ class Evaluator:
         rows = np.asarray(env.reset_rows(key, max(self._sizes.values())))
         self.rows = np.concatenate([rows[:count] for count in self._sizes.values()])
         self._noise = np.repeat(np.float32(list(self._sizes)), list(self._sizes.values()))
-        self._key = jax.random.fold_in(key, 2)
+        self._key = np.asarray(jax.random.fold_in(key, 2))
         # The discrepancy is in the paper's features whatever the run's own are, so that it compares.
         paper = FeatureConfig(history=env.horizon)
         windows, share = env.clip_windows(), trainer.library.window_share(env.horizon)
