@@ -107,6 +107,13 @@ def main() -> None:
         update, state = jax.jit(prior.update), prior.init(prior_key)
         return lambda: update(state, rollout, key)
 
+    if arguments.whole:  # first: the parts below take a minute to compile on an accelerator
+        call = scan(fitted.updates)
+        seconds(call)
+        calls = REPORTED_UPDATES // fitted.updates
+        taken = sum(seconds(call) for _ in range(calls))
+        print(f"{calls * fitted.updates:,} updates made, with their {calls} scorings: {taken:,.1f} s", flush=True)
+
     few, many = scan(FEW), scan(MANY)
     pool = features.reshape(-1, size)
     warm = many()
@@ -139,12 +146,6 @@ def main() -> None:
     )
     print(f"{'update over floor':<24}{update / floor:>8.2f}")
     print(f"{REPORTED_UPDATES:,} updates at that: {REPORTED_UPDATES * update / 1e3:,.0f} s")
-    if arguments.whole:
-        call = scan(fitted.updates)
-        seconds(call)
-        calls = REPORTED_UPDATES // fitted.updates
-        taken = sum(seconds(call) for _ in range(calls))
-        print(f"{calls * fitted.updates:,} updates made, with their {calls} scorings: {taken:,.1f} s")
 
 
 if __name__ == "__main__":
