@@ -334,8 +334,9 @@ def _runs():
     """`fmpjax.runs`, imported when a command needs it."""
     import jax
 
-    from fmpjax import runs
+    from fmpjax import machine, runs
 
+    machine.keep_compiled()
     try:
         jax.devices()
     except (RuntimeError, AssertionError):  # which of them depends on the plugins that are installed

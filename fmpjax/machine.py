@@ -1,7 +1,9 @@
 """What this machine has and can do: cores, memory, systems that the package runs on."""
 
 import contextlib
+import hashlib
 import os
+import platform
 import sys
 from pathlib import Path
 
@@ -33,6 +35,37 @@ def memory() -> int | None:
         with contextlib.suppress(OSError, ValueError):  # "max" is no number
             found.append(int(Path(path).read_text()))
     return min((size for size in found if size > 0), default=None)
+
+
+def keep_compiled() -> None:
+    """Have JAX keep compiled programs in the user's cache folder, 1 GiB at most, so that a second run starts at once.
+
+    ``JAX_COMPILATION_CACHE_DIR`` names another folder, or none where it is empty. Machine code is of one kind of
+    processor, so each has a folder of its own. Runs may share it.
+    """
+    import jax
+
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = base / "fmpjax" / "compiled" / hashlib.sha256(_processor().encode()).hexdigest()[:12]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # a home that cannot be written keeps none
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_compilation_cache_max_size", 2**30)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _processor() -> str:
+    """What tells kinds of processors apart."""
+    told = [platform.machine(), platform.processor()]
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        told += sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
+    return "\n".join(told)
 
 
 def import_mujoco() -> None:

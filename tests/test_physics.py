@@ -12,7 +12,7 @@ import pytest
 from fmpjax import physics, robots
 from fmpjax.config import PhysicsConfig, preset
 from fmpjax.errors import UserError
-from fmpjax.physics import native
+from fmpjax.physics import ffi, native
 
 PAPER = PhysicsConfig(backend="native")
 LAPTOP = dataclasses.replace(preset("laptop").physics, backend="native")
@@ -309,3 +309,33 @@ def test_mjx_collides_as_native_does(entangled, impl):
     position, velocity = (np.abs(a - b).max(axis=(1, 2)) for a, b in zip(ours[:2], theirs[:2], strict=True))
     print(f"native and {impl}, touching itself: qpos {position}, qvel {velocity}")
     assert position.max() < 2e-4 and velocity.max() < 2e-2
+
+
+# --- NumPy functions in compiled programs ----------------------------------------------------------------------------
+
+
+def test_a_foreign_functions_error_ends_the_program():
+    """An exception must not be printed and forgotten, with whatever was in memory as the result."""
+
+    def broken(argument, result):
+        raise ValueError("no such thing")
+
+    ffi.register("fmpjax_test_broken", broken)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="ValueError: no such thing"):
+        jax.block_until_ready(jax.jit(lambda x: ffi.call("fmpjax_test_broken", x, 2))(jnp.ones((3, 4))))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_foreign_function_sees_and_fills_the_programs_arrays(dtype):
+    ffi.register("fmpjax_test_double", lambda x, y: np.multiply(x[..., :2], 2, out=y))
+    with jax.enable_x64(dtype == np.float64):
+        given = np.random.default_rng(0).normal(size=(2, 3, 4)).astype(dtype)
+        reached = jax.jit(jax.vmap(lambda x: ffi.call("fmpjax_test_double", x, 2)))(given)
+        assert reached.dtype == dtype
+        np.testing.assert_array_equal(reached, 2 * given[..., :2])
+
+
+def test_physics_is_called_by_what_it_computes(robot):
+    """The name in a program that is kept stands for the model and its options."""
+    names = [physics.make(robot, c)._function for c in (LAPTOP, LAPTOP, PAPER, dataclasses.replace(LAPTOP, substeps=1))]
+    assert names[0] == names[1] and len(set(names)) == 3

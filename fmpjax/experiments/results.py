@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fmpjax import jsons, shell
+from fmpjax import jsons, machine, shell
 from fmpjax.errors import UserError
 from fmpjax.shell import Group
 
@@ -95,4 +95,5 @@ def _cell(value: Any) -> Any:
 def entry(main: Callable[..., Any] | Group, arguments: Sequence[str] | None = None) -> None:
     """An experiment's command line, or that of several by name: bad input is one sentence and exit code 2."""
     with shell.ending():
+        machine.keep_compiled()
         shell.parse(main, shell.program(), arguments)
