@@ -131,6 +131,14 @@ class Check(Source):
     def __call__(self) -> None:
         from fmpjax.motion import check, edit
 
+        for name, value, allowed in (
+            ("axes", self.axes, ("world", "heading")),
+            ("reset", self.reset, ("dataset", "fixed")),
+        ):
+            if value not in allowed:
+                raise UserError(f"--{name} is {value!r}: expected {' or '.join(allowed)}")
+        if not self.seconds > 0:
+            raise UserError(f"--seconds is {self.seconds:g}: expected more than 0")
         if self.fix != (self.out is not None):
             raise UserError("--fix and --out go together: one asks for a fixed motion, the other names its file")
         robot = robots.load(self.robot)

@@ -28,7 +28,7 @@ class PhysicsConfig:
     ls_iterations: int = 20  # line-search iterations at most [D]
     frictionloss: float = 0.1  # N m, joint friction [M]
     threads: int = 0  # threads of the native backend, 0 for every core [D]
-    max_contacts: int = 24  # contacts of one world that MJX keeps: the nearest, or those that Warp finds first [D]
+    max_contacts: int = 40  # contacts of one world: MJX in JAX keeps the nearest, Warp's buffer has room for them [D]
     max_constraints: int = 256  # constraint rows of one world in the buffers of impl="warp" [D]
 
 
@@ -351,12 +351,20 @@ def to_json(config: Config) -> str:
 
 
 # What settings were before they existed, where that is not the default: what an older file without them means.
-_BEFORE: dict[str, Any] = {"precision": "default", "env.demonstration_parts": 1, "env.early_frames": False}
+_BEFORE: dict[str, Any] = {
+    "precision": "default",
+    "env.demonstration_parts": 1,
+    "env.early_frames": False,
+    "evaluation_noise": (0.0,),
+}
 
 
 def from_json(text: str) -> Config:
     """The configuration that `to_json` wrote."""
-    return validate(with_changes(Config(), {**_BEFORE, **json.loads(text)}))
+    settings = json.loads(text)
+    if not isinstance(settings, dict):
+        raise json.JSONDecodeError("no object", text, 0)
+    return validate(with_changes(Config(), {**_BEFORE, **settings}))
 
 
 def read(path: Path) -> Config:
@@ -367,7 +375,7 @@ def read(path: Path) -> Config:
     """
     try:
         return from_json(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError, AttributeError):
+    except (json.JSONDecodeError, UnicodeDecodeError):
         raise UserError(f"{path} is not valid JSON: expected a run's configuration") from None
 
 

@@ -138,16 +138,32 @@ class Rule:
         if value is None or value in self.healthy:
             return None
         settings = configuration.flatten(course.config)
-        other = "prior." if course.config.method == "amp" else "amp."  # settings of the rewards that it does not have
-        look = [f"{key} (now {settings[key]})" for key in self.look if not key.startswith(other)]
+        # A switch that is off already is no advice.
+        mine = [key for key in self.look if _reads(course.config.method, key) and settings[key] is not False]
+        look = [f"{key} (now {settings[key]})" for key in mine]
         where = " and ".join([", ".join(look[:-1]), look[-1]] if look[1:] else look)
         says = self.says.format_map(course)
         return f"{says}: {self.figure} is {value:.3g}, healthy is {self.healthy}; look at {where}."
 
 
+_READ_BY = {
+    "prior.query_is_bank": ("fmp", "endpoint", "value"),
+    "prior.endpoint_weight": ("fmp", "endpoint"),
+    "prior.flow_weight": ("fmp",),
+    "prior.temperature": ("barycentric",),
+}
+
+
+def _reads(method: str, setting: str) -> bool:
+    """Whether the reward reads the setting, or it is not one of a reward."""
+    if setting in _READ_BY:
+        return method in _READ_BY[setting]
+    return (method == "amp") == setting.startswith("amp.") if setting.startswith(("amp.", "prior.")) else True
+
+
 def _fallen(course: Course) -> float:
     """Share of the evaluation's episodes that end in a fall."""
-    return course["eval/falls"] / course["eval/episodes"]
+    return course["eval/falls"] / max(course["eval/episodes"], 1.0)
 
 
 def _fall_step(course: Course) -> float:
@@ -210,7 +226,9 @@ def _limp(course: Course) -> float | None:
     """Imbalance less the demonstration's own, which only evaluation.json tells."""
     if _fallen(course) > 0.5 or course["eval/excursion"] < STEPS:
         return None
-    ranges = course.evaluation.get("expert_ranges") or ()
+    ranges = course.evaluation.get("expert_ranges")
+    if not isinstance(ranges, list) or not all(isinstance(value, int | float) for value in ranges):
+        ranges = []
     pairs = list(zip(ranges[: len(ranges) // 2], ranges[len(ranges) // 2 :], strict=False))
     own = sum(2.0 * abs(a - b) / max(a + b, 1e-9) for a, b in pairs) / max(len(pairs), 1)
     return course["eval/imbalance"] - own

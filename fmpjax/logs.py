@@ -10,6 +10,8 @@ from pathlib import Path
 
 from tensorboardX import SummaryWriter
 
+from fmpjax.errors import UserError
+
 _FIRST = ("iteration", "transitions", "seconds")
 
 
@@ -24,6 +26,8 @@ class MetricsLog:
         self._path = run / "metrics.csv"
         self._columns = [*_FIRST, *columns]
         rows = self.read(self._path) if iteration else []
+        # Columns that only an earlier version wrote stay.
+        self._columns += [name for name in (rows[0] if rows else ()) if name not in self._columns]
         self.rows = [row for row in rows if int(row["iteration"]) <= iteration]
         if not keep:
             return
@@ -66,8 +70,11 @@ class MetricsLog:
         """Rows of a metrics file; an incomplete last line is left out."""
         if not path.exists():
             return []
-        with path.open(newline="") as file:
-            return [row for row in csv.DictReader(file) if None not in row.values() and set(_FIRST) <= set(row)]
+        try:
+            with path.open(newline="") as file:
+                return [row for row in csv.DictReader(file) if None not in row.values() and set(_FIRST) <= set(row)]
+        except (UnicodeDecodeError, csv.Error):
+            raise UserError(f"{path} cannot be read: expected the table that training writes") from None
 
 
 class Progress:

@@ -47,11 +47,11 @@ def keep_compiled() -> None:
 
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = base / "fmpjax" / "compiled" / hashlib.sha256(_processor().encode()).hexdigest()[:12]
     try:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = base / "fmpjax" / "compiled" / hashlib.sha256(_processor().encode()).hexdigest()[:12]
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # a home that cannot be written keeps none
+    except (OSError, RuntimeError):  # without a home, or with one that cannot be written, nothing is kept
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_compilation_cache_max_size", 2**30)

@@ -291,14 +291,14 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
                     better = evaluation.quality >= best[i]
                 # Rows ahead of their checkpoint are computed again after a kill; rows behind it would be missing.
                 log.write(done, transitions, training_seconds, row)
-                if evaluating:
-                    figures = json.loads(evaluation.to_json())
-                    progress.note(diagnose.text(diagnose.Course(log.rows, config, figures)))
                 if better:
                     best[i] = evaluation.quality
                     _save(run, whole[i], best=True)
                 if saving:
                     _save(run, whole[i])
+                if evaluating:
+                    figures = json.loads(evaluation.to_json())
+                    progress.note(diagnose.text(diagnose.Course(log.rows, config, figures)))
             if saving:
                 saved = time.monotonic()
             if evaluating:
@@ -411,9 +411,10 @@ def finish(run: Run) -> list[Path]:
     run.save_evaluation(evaluation)
     transitions = int(state.iteration) * trainer.config.transitions_per_iteration
     print(f"best policy, {transitions:,} transitions:\n{table(evaluation)}")
+    paths = [run.folder / "evaluation.json", *_pictures(run, trainer, played)]
     if (run.folder / "metrics.csv").exists() and MetricsLog.read(run.folder / "metrics.csv"):
         print(diagnose.text(diagnose.read(run.folder)))
-    return [run.folder / "evaluation.json", *_pictures(run, trainer, played)]
+    return paths
 
 
 def _pictures(run: Run, trainer: Trainer, played) -> list[Path]:
@@ -433,7 +434,7 @@ def _pictures(run: Run, trainer: Trainer, played) -> list[Path]:
         try:
             paths.append(make())
         except Exception as error:  # whatever it is, the training is finished
-            print(f"no {name}: {error or type(error).__name__}")
+            print(f"no {name}: {str(error) or type(error).__name__}", file=sys.stderr)
     return paths
 
 

@@ -62,10 +62,18 @@ def test_paper_preset_is_the_paper():
 def test_an_older_file_means_what_it_meant():
     """Settings that came later are, in a file without them, what the program did before they came."""
     older = json.loads(configuration.to_json(configuration.preset("paper", robot="unitree_g1")))
-    for key in ("precision", "env.demonstration_parts", "env.early_frames"):
+    for key in ("precision", "env.demonstration_parts", "env.early_frames", "evaluation_noise"):
         del older[key]
     read = configuration.from_json(json.dumps(older))
     assert (read.precision, read.env.demonstration_parts, read.env.early_frames) == ("default", 1, False)
+    assert read.evaluation_noise == (0.0,)
+
+
+@pytest.mark.parametrize("text", ["[]", "3", "null", "{"])
+def test_a_file_that_is_no_object_is_refused(tmp_path, text):
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(UserError, match="config.json is not valid JSON: expected a run's configuration"):
+        configuration.read(tmp_path / "config.json")
 
 
 @pytest.mark.slow

@@ -46,7 +46,7 @@ def test_bundled_file_is_what_the_package_writes(robot, walk):
         ("range_right_ankle", 25, 30),
         ("slip", 0, 0.005),
         ("penetration", 0, 0.005),
-        ("gap", 0, 0.005),
+        ("gap", -0.0011, 0.005),
         ("clearance", 0.015, 0.05),
         ("limit_margin", 0.1, np.inf),
         ("joint_speed", 3, 9),
@@ -129,13 +129,13 @@ def test_figures_notice_a_bad_walk(robot, walk):
     """Each figure is worth its name: a sunk, slid or jerked clip fails."""
     sunk = walk.qpos.copy()
     sunk[:, 2] -= 0.01
-    assert gait.measure(robot, _clip(walk, sunk))["penetration"] == pytest.approx(0.01, abs=1e-4)
+    assert gait.measure(robot, _clip(walk, sunk))["penetration"] == pytest.approx(0.01 + robots.CONTACT_DEPTH, abs=1e-4)
     slid = walk.qpos.copy()
     slid[:, 0] *= 1.1
     assert gait.measure(robot, _clip(walk, slid))["slip"] > 0.02
     raised = walk.qpos.copy()
     raised[:, 2] += 0.01
-    assert gait.measure(robot, _clip(walk, raised))["gap"] == pytest.approx(0.01, abs=1e-4)
+    assert gait.measure(robot, _clip(walk, raised))["gap"] == pytest.approx(0.01 - robots.CONTACT_DEPTH, abs=1e-4)
     jerked = walk.qpos.copy()
     jerked[100, 10] += 0.2
     assert gait.measure(robot, _clip(walk, jerked))["joint_acceleration"] > 200

@@ -321,7 +321,7 @@ def test_broken_clip_is_exit_code_one_until_it_is_fixed(tmp_path, capsys, walk):
 
     path = motion.save(changed(walk, sink), tmp_path / "sunk.npz")
     assert code("check", path) == 1
-    assert "penetration        0.2 m               0 to 0.02   broken" in capsys.readouterr().out
+    assert "penetration        0.201 m             0 to 0.02   broken" in capsys.readouterr().out
     run("check", path, "--fix", "--out", tmp_path / "up.npz")
     assert "moved up by 200.0 mm" in capsys.readouterr().out
     run("check", tmp_path / "up.npz")
@@ -346,9 +346,12 @@ def test_pictures(tmp_path, robot, walk, monkeypatch):
         (("check", "walk", "--fix"), "--fix and --out go together"),
         (("check", "walk", "--frames", "0:3"), "4 frames, expected at least 11"),
         (("check", "walk", "--robot", "h1"), "unknown robot 'h1'"),
+        (("check", "walk", "--axes", "sideways"), "--axes is 'sideways': expected world or heading"),
+        (("check", "walk", "--reset", "nope"), "--reset is 'nope': expected dataset or fixed"),
+        (("check", "walk", "--seconds", "-3"), "--seconds is -3: expected more than 0"),
         (("view", "walk", "--out", "a.bmp"), "expected a name that ends in .png, .mp4 or .gif"),
         (("plot", "walk", "--out", "a.pdf"), "expected a name that ends in .png"),
-        (("synthesize", "--out", "a.npz", "--speed", "-1"), "speed is -1"),
+        (("synthesize", "--out", "a.npz", "--speed", "-9"), "speed -9 m/s is out of the legs' reach"),
     ],
 )
 def test_bad_input(tmp_path, monkeypatch, capsys, arguments, word):
@@ -478,3 +481,8 @@ def test_the_papers_stretch_is_found(external, robot):
 def test_real_clips_are_fit(robot, external, name, frames):
     clip = motion.load(external(name), frames=frames)
     assert "broken" not in {figure.verdict for figure in check.check(robot, clip)}
+
+
+def test_a_clip_is_not_repeated_without_end(walk):
+    with pytest.raises(UserError, match="--repeat is 100000000: 379 samples so often are more than"):
+        edit.repeated(walk, 100_000_000)

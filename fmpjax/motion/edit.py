@@ -8,8 +8,9 @@ import numpy as np
 from fmpjax import rotations
 from fmpjax.errors import UserError
 from fmpjax.motion.clip import MotionClip, resample
+from fmpjax.motion.readers.recording import MOST_SAMPLES
 from fmpjax.motion.soles import sole_points
-from fmpjax.robots import Robot
+from fmpjax.robots import CONTACT_DEPTH, Robot
 
 BLEND = 0.4  # s, over which a loop is closed
 LOW = 5  # per cent of the samples may have the lowest sole below the floor after a shift
@@ -82,7 +83,13 @@ def looped(clip: MotionClip) -> MotionClip:
 
 
 def repeated(clip: MotionClip, times: int) -> MotionClip:
-    """The clip ``times`` times on end, each copy where the one before has ended, after its ends are made to meet."""
+    """The clip ``times`` times in a row, each copy where the one before has ended, after its ends are made to meet.
+
+    Raises:
+      UserError: the result has more samples than a motion may have.
+    """
+    if (len(clip) - 1) * times >= MOST_SAMPLES:
+        raise UserError(f"--repeat is {times}: {len(clip)} samples so often are more than {MOST_SAMPLES}")
     closed, turn = looped(clip).qpos, np.array([1.0, 0.0, 0.0, 0.0])
     pieces, place = [closed[:1]], closed[0, :3]
     step = closed[1:] - np.concatenate([closed[0, :3], np.zeros(clip.qpos.shape[1] - 3)])
@@ -141,7 +148,7 @@ def fixed(robot: Robot, clip: MotionClip) -> tuple[MotionClip, list[str]]:
         samples, most = np.count_nonzero(moved[:, joint]), moved[:, joint].max()
         said.append(f"{robot.joint_names[joint]} clipped in {samples} samples, by {most:.3f} rad at most")
     points, _ = sole_points(robot, qpos)
-    shift = -float(np.percentile((points[..., 2] - robot.sole_radius).min(axis=1), LOW))
+    shift = -CONTACT_DEPTH - float(np.percentile((points[..., 2] - robot.sole_radius).min(axis=1), LOW))
     if abs(shift) > 1e-4:
         qpos[:, 2] += shift
         said.append(f"moved {'up' if shift > 0 else 'down'} by {abs(shift) * 1000:.1f} mm")

@@ -10,7 +10,7 @@ from fmpjax.motion.soles import slip, sole_points
 from fmpjax.robots import Robot
 
 
-def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.002) -> dict[str, float]:
+def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.001) -> dict[str, float]:
     """Quality figures of a steady walk.
 
     A sole point is in contact while its lowest point is less than ``contact`` (m) above the floor.

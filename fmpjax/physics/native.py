@@ -1,6 +1,6 @@
 """MuJoCo C on every core, called from inside the scanned loop.
 
-On a CPU this is an order of magnitude faster than MJX. The callback is pure: the next state depends on its arguments
+On a CPU this is an order of magnitude faster than MJX. The function is pure: the next state depends on its argument
 alone.
 """
 
