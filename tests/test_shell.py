@@ -73,7 +73,8 @@ def test_help_names_the_defaults_of_training(shown):
     text = " ".join(re.sub("[│\n]", " ", shown("fmpjax", "train", "--help")).split())
     for option, value in {
         "method STR": "fmp", "motion STR": "walk",
-        "robot STR": "unitree_g1 in smoke and laptop, unitree_g1_29dof in paper", "reset STR": "dataset", "seed INT": "0",
+        "robot STR": "unitree_g1 in smoke and laptop, unitree_g1_29dof in paper",
+        "reset STR": "dataset", "seed INT": "0",
         "preset STR": "laptop on a CPU, paper on an accelerator",
         "transitions INT": "10,240 in smoke, 6,000,000 in laptop, 50,003,968 in paper",
     }.items():  # fmt: skip
