@@ -40,7 +40,7 @@ def test_the_model(strider):
     np.testing.assert_allclose(strider.stiffness, armature * omega**2, rtol=1e-4)
     np.testing.assert_allclose(strider.damping, 4 * armature * omega, rtol=1e-4)
     np.testing.assert_array_equal(model.actuator_trnid[:, 0], np.arange(1, 1 + JOINTS))
-    np.testing.assert_allclose(robots.lowest_sole(strider, strider.default_qpos), 0, atol=1e-12)
+    np.testing.assert_allclose(robots.lowest_sole(strider, strider.default_qpos), -robots.CONTACT_DEPTH, atol=1e-12)
 
 
 def test_the_model_is_its_own_mirror_image(strider):
