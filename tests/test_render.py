@@ -168,7 +168,7 @@ def test_a_picture_that_fails_does_not_fail_a_finished_training(tmp_path, monkey
     monkeypatch.setattr(runs, "video", refuse)
     monkeypatch.setattr(runs.curves, "learning_curves", lambda table, picture: picture)
     assert runs._pictures(run, None, None) == [tmp_path / "curves.png"]
-    assert capsys.readouterr().out == "no frames.png: no driver\nno policy.mp4: cannot write policy.mp4: no space\n"
+    assert capsys.readouterr().err == "no frames.png: no driver\nno policy.mp4: cannot write policy.mp4: no space\n"
 
 
 def _noise(count: int) -> np.ndarray:
