@@ -64,7 +64,7 @@ needs_make = pytest.mark.skipif(not shutil.which("make"), reason="no make here")
 
 def _make(*arguments: str) -> subprocess.CompletedProcess:
     # What is running these tests may itself be make, with variables of its own.
-    environment = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS")}
+    environment = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKELEVEL", "MAKEOVERRIDES", "MFLAGS")}
     return subprocess.run(
         ["make", "--dry-run", *arguments], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60
     )
@@ -108,7 +108,7 @@ def test_the_check_of_a_submission_lints_and_tests_and_installs_once(tmp_path):
     stub = tmp_path / "make"
     stub.write_text(f'#!/bin/sh\nexec {shutil.which("make")} --dry-run VENV=nowhere UV=uv "$@"\n')
     stub.chmod(0o755)
-    environment = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS")}
+    environment = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKELEVEL", "MAKEOVERRIDES", "MFLAGS")}
     environment["PATH"] = f"{tmp_path}{os.pathsep}{environment['PATH']}"
     done = subprocess.run([ROOT / ".ci" / "run"], env=environment, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
