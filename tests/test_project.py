@@ -62,11 +62,15 @@ def test_the_examples_of_the_readme_run(tmp_path, monkeypatch):
 needs_make = pytest.mark.skipif(not shutil.which("make"), reason="no make here")
 
 
+def _environment() -> dict[str, str]:
+    """This process's, less what make tells its children: these tests may be run by make themselves."""
+    own = ("MAKEFLAGS", "MAKELEVEL", "MAKEOVERRIDES", "MFLAGS")
+    return {name: value for name, value in os.environ.items() if name not in own}
+
+
 def _make(*arguments: str) -> subprocess.CompletedProcess:
-    # What is running these tests may itself be make, with variables of its own.
-    environment = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKELEVEL", "MAKEOVERRIDES", "MFLAGS")}
     return subprocess.run(
-        ["make", "--dry-run", *arguments], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60
+        ["make", "--dry-run", *arguments], cwd=ROOT, env=_environment(), capture_output=True, text=True, timeout=60
     )
 
 
@@ -108,7 +112,7 @@ def test_the_check_of_a_submission_lints_and_tests_and_installs_once(tmp_path):
     stub = tmp_path / "make"
     stub.write_text(f'#!/bin/sh\nexec {shutil.which("make")} --dry-run VENV=nowhere UV=uv "$@"\n')
     stub.chmod(0o755)
-    environment = {k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MAKELEVEL", "MAKEOVERRIDES", "MFLAGS")}
+    environment = _environment()
     environment["PATH"] = f"{tmp_path}{os.pathsep}{environment['PATH']}"
     done = subprocess.run([ROOT / ".ci" / "run"], env=environment, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
