@@ -10,11 +10,11 @@
 # `fmpjax train`, for example --motion FILE --frames 2370:2580. A run that was packed here continues on another machine:
 # unpack it, then `fmpjax train --resume --run OUT/run`.
 #
-# PYTHON names the interpreter. SMOKE=1 makes everything small, to try the script on a CPU.
+# PYTHON names the interpreter, LIMIT a step's seconds (100). SMOKE=1 makes everything small, to try it on a CPU.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PYTHON=${PYTHON:-python}
-export PYTHONUNBUFFERED=1 MUJOCO_GL=${MUJOCO_GL:-egl}
+export PYTHONUNBUFFERED=1
 PIECE=15M # of a packed run: some ways home take no larger files
 
 usage() {

@@ -337,5 +337,6 @@ def test_a_foreign_function_sees_and_fills_the_programs_arrays(dtype):
 
 def test_physics_is_called_by_what_it_computes(robot):
     """The name in a program that is kept stands for the model and its options."""
-    names = [physics.make(robot, c)._function for c in (LAPTOP, LAPTOP, PAPER, dataclasses.replace(LAPTOP, substeps=1))]
-    assert names[0] == names[1] and len(set(names)) == 3
+    made = [physics.make(robot, c) for c in (LAPTOP, LAPTOP, PAPER, dataclasses.replace(LAPTOP, substeps=1))]
+    assert made[0]._function == made[1]._function and len({each._function for each in made}) == 3
+    assert made[0]._pool is made[1]._pool and made[0]._pool is not made[2]._pool

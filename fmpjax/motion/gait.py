@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fmpjax import robots
 from fmpjax.errors import UserError
 from fmpjax.motion.balance import zero_moment_point
 from fmpjax.motion.clip import MotionClip
@@ -159,7 +160,9 @@ def make(robot: Robot, command: Command, *, rate: float = 50.0, style: Style = O
         style's phases are out of order; the command is out of the legs' reach.
     """
     if not robot.gait:
-        raise UserError(f"robot {robot.name!r} has no [gait] in its robot.toml, which says how it walks")
+        raise UserError(
+            f"robot {robot.name!r} has no [gait] in its robot.toml, which says how it walks{_others(robot)}"
+        )
     _check(robot, command, rate, style)
     if style.named() and command.speed > 0 and not command.sideways:
         own = style.on(robot)
@@ -186,6 +189,12 @@ def make(robot: Robot, command: Command, *, rate: float = 50.0, style: Style = O
         if name not in given and not math.isclose(value, getattr(own, name), rel_tol=1e-9)
     ]
     return Gait(robot, command, rate, stride.style, tuple(chosen), stride.way, stride.angle, qpos)
+
+
+def _others(robot: Robot) -> str:
+    """Which robots' walks it takes instead, for a message."""
+    others = [name for name in robots.available() if name != robot.name and robot.takes(name)]
+    return f"; it takes the walks of {', '.join(others)}" if others else ""
 
 
 def _check(robot: Robot, command: Command, rate: float, style: Style) -> None:

@@ -19,6 +19,9 @@ from fmpjax.physics import ffi
 from fmpjax.physics.base import PhysicsState
 from fmpjax.robots import Robot
 
+# The backend that serves a name; XLA keeps its address for good, so those of the same name share its threads.
+_FIRST: dict[str, "NativePhysics"] = {}
+
 
 class NativePhysics:
     """MuJoCo's threaded rollout as a foreign function of XLA; behind `jax.pure_callback` beside an accelerator."""
@@ -29,14 +32,17 @@ class NativePhysics:
         self.model = model(robot, config)
         self.substeps = config.substeps
         self.threads = config.threads or machine.cores()
-        self._pool = mujoco.rollout.Rollout(nthread=self.threads)
-        self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
-        self._turn = threading.Lock()  # several devices call back at once; the threads serve one after another
         # All that a step depends on is in the name, by which a program that was kept finds it.
         image = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, image)
         told = f"{config.substeps} {config.threads}".encode() + image.tobytes()
         self._function = f"fmpjax_native_{hashlib.sha256(told).hexdigest()[:16]}"
+        if (first := _FIRST.setdefault(self._function, self)) is not self:
+            self._pool, self._data, self._turn = first._pool, first._data, first._turn
+            return
+        self._pool = mujoco.rollout.Rollout(nthread=self.threads)
+        self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
+        self._turn = threading.Lock()  # several devices call back at once; the threads serve one after another
         ffi.register(self._function, self._advance)
 
     def step(self, state: PhysicsState, targets: jax.Array) -> PhysicsState:
