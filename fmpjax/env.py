@@ -7,7 +7,6 @@ construction.
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -15,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fmpjax import features, physics, sharding
+from fmpjax.acting import Policy
 from fmpjax.config import Config
 from fmpjax.features import Observed
 from fmpjax.motion import MotionClip, MotionLibrary
@@ -23,6 +23,7 @@ from fmpjax.robots import Robot
 
 # Faster than any joint or fall of a robot of this size, rad/s or m/s: such a state has blown up.
 _VELOCITY_LIMIT = 1e3
+_LIMITS = physics.PhysicsState(np.inf, _VELOCITY_LIMIT, np.inf)
 
 
 # Fields of `EnvState` with a leading axis of environments.
@@ -63,10 +64,6 @@ class Steps(NamedTuple):
     length: jax.Array  # [T, N] int32, steps of the episode up to and including this one
     frame: jax.Array  # [T, N, F] compact frame after the step, before any reset
     window: jax.Array  # [T, N, H] int32 indices into the frame table
-
-
-# observation, key -> normalised action [N, J] and what to remember of it
-PolicyFn = Callable[[jax.Array, jax.Array], tuple[jax.Array, dict[str, jax.Array]]]
 
 
 class ActionMap(NamedTuple):
@@ -196,7 +193,7 @@ class Env:
         """All environments at fresh resets."""
         return self.start_at(self.reset_rows(key, self.config.count), jax.random.fold_in(key, 2))
 
-    def rollout(self, state: EnvState, policy: PolicyFn, key: jax.Array, steps: int) -> tuple[EnvState, Steps]:
+    def rollout(self, state: EnvState, policy: Policy, key: jax.Array, steps: int) -> tuple[EnvState, Steps]:
         """``steps`` control steps under a policy; falls and time-outs reset at once."""
         count = len(state.age)
         before = self.clip_rows + 1  # rows ahead of the frames before the rollout
@@ -204,9 +201,8 @@ class Env:
 
         def step(carry, inputs):
             sim, observed, age, window, offenders = carry
-            index, key = inputs
-            policy_key, reset_key = jax.random.split(key)
-            action, extras = policy(observed.actor, policy_key)
+            index, drawn, start, reset_key = inputs
+            action, extras = policy.act(observed.actor, drawn)
             here = Offender(sim.qpos, sim.qvel, action)
             sim, reached, fell, finite = self._advance(sim, action)
             # Each environment keeps its own, which needs no word from the others while the rollout goes on.
@@ -228,8 +224,7 @@ class Env:
                 window=window,
             )
             done = fell | timed_out
-            start = self.reset_rows(reset_key, count)
-            begun = self._begin(start, jax.random.fold_in(reset_key, 2))
+            begun = self._begin(start, reset_key)
 
             def choose(fresh, old):
                 return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), fresh, old)
@@ -244,12 +239,17 @@ class Env:
             )
             return carry, record
 
+        # Random numbers of all steps at once: drawn step by step they are most of a small step's launches.
+        policy_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(key, steps))
+        drawn = jax.vmap(lambda key: policy.draw(key, (count,)))(policy_keys)
+        starts = jax.vmap(lambda key: self.reset_rows(key, count))(reset_keys)
+        noise_keys = jax.vmap(lambda key: jax.random.fold_in(key, 2))(reset_keys)
         window = before + jnp.arange(count * self.horizon).reshape(count, self.horizon)
         nobody = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), state.offender)
         (sim, observed, age, window, offenders), record = jax.lax.scan(
             step,
             (state.physics, state.observed, state.age, window, nobody),
-            (jnp.arange(steps), jax.random.split(key, steps)),
+            (jnp.arange(steps), drawn, starts, noise_keys),
         )
         # The last step's first.
         when = jnp.where(record.nonfinite, jnp.arange(1, steps + 1)[:, None], 0).max(0)
@@ -293,5 +293,6 @@ class Env:
 
 def _finite(sim: physics.PhysicsState) -> jax.Array:
     """Whether each environment's state is finite and has not blown up, ``[N]`` bool."""
-    sane = jnp.isfinite(sim.qpos).all(-1) & jnp.isfinite(sim.warmstart).all(-1)
-    return sane & (jnp.abs(sim.qvel) < _VELOCITY_LIMIT).all(-1)
+    # One array, one limit a column: not-a-number is below none.
+    limit = np.concatenate([np.full(x.shape[-1], most, np.float32) for x, most in zip(sim, _LIMITS, strict=True)])
+    return (jnp.abs(jnp.concatenate(sim, axis=-1)) < limit).all(-1)

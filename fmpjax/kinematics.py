@@ -24,37 +24,49 @@ class BodyPoses(NamedTuple):
 
 def body_poses(robot: Robot, qpos: jax.Array) -> BodyPoses:
     """Body poses of ``qpos [..., 7 + J]`` (root xyz m, root quaternion wxyz, joints rad)."""
-    dtype = qpos.dtype
-    bodies = len(robot.body_parent)
-    hinged = robot.body_joint >= 0
-    axis = np.zeros((bodies, 3))
-    axis[hinged] = robot.joint_axis[robot.body_joint[hinged]]
-    half = jnp.where(hinged, qpos[..., 7 + np.maximum(robot.body_joint, 0)], 0.0)[..., None] / 2
-    hinge_wxyz = jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis.astype(dtype)], axis=-1)
-    local_wxyz = rotations.multiply(jnp.asarray(robot.body_rotation_wxyz, dtype), hinge_wxyz)
-    rotation_wxyz = local_wxyz.at[..., 0, :].set(qpos[..., 3:7])
-    position = jnp.broadcast_to(jnp.asarray(robot.body_position, dtype), (*qpos.shape[:-1], bodies, 3))
-    position = position.at[..., 0, :].set(qpos[..., :3])
+    state = jnp.moveaxis(qpos, -1, 0)  # components first: a kernel then reads and writes whole rows
+
+    def column(constant: np.ndarray) -> np.ndarray:  # [B, k] -> [k, B, 1...]
+        return constant.T.reshape(*constant.T.shape, *[1] * (qpos.ndim - 1)).astype(qpos.dtype)
+
+    # Each body but the first against its parent: a turn about the hinge, if it has one, after the body's own rotation.
+    hinged, joint = robot.body_joint[1:] >= 0, np.maximum(robot.body_joint[1:], 0)
+    rest_wxyz, axis = robot.body_rotation_wxyz[1:], np.where(hinged[:, None], robot.joint_axis[joint], 0.0)
+    turn_wxyz = rotations.multiply(rest_wxyz, np.concatenate([np.zeros((len(axis), 1)), axis], axis=1))
+    half = state[7 + joint] / 2
+    if not hinged.all():
+        half = half * column(hinged[:, None])[0]
+    local_wxyz = jnp.cos(half) * column(rest_wxyz) + jnp.sin(half) * column(turn_wxyz)
+    local_position = jnp.broadcast_to(column(robot.body_position[1:]), (3, *half.shape))
+    root = jnp.concatenate([state[3:7], state[:3]])
+    parts = jnp.concatenate([root[:, None], jnp.concatenate([local_wxyz, local_position])], axis=1)
 
     ancestor = robot.body_parent.copy()
     while (ancestor >= 0).any():
         # Only bodies that still have an ancestor move on; the others already stand in the world.
         moving = np.flatnonzero(ancestor >= 0)
-        above_wxyz = rotation_wxyz[..., ancestor[moving], :]
-        below = position[..., moving, :]
-        new_position = position[..., ancestor[moving], :] + rotations.rotate(above_wxyz, below)
-        new_wxyz = rotations.multiply(above_wxyz, rotation_wxyz[..., moving, :])
-        position = position.at[..., moving, :].set(new_position)
-        rotation_wxyz = rotation_wxyz.at[..., moving, :].set(new_wxyz)
+        parts = parts.at[:, moving].set(_composed(parts[:, ancestor[moving]], parts[:, moving]))
         ancestor = np.where(ancestor >= 0, ancestor[np.maximum(ancestor, 0)], -1)
-    return BodyPoses(position, rotation_wxyz)
+    return BodyPoses(_components_last(parts[4:]), _components_last(parts[:4]))
+
+
+def _composed(outer: jax.Array, inner: jax.Array) -> jax.Array:
+    """Poses ``[7, ...]`` that are told in the frames of other poses, told in the frames of those."""
+    rotation_wxyz = rotations.multiplied(outer[:4], inner[:4])
+    moved = rotations.rotated(outer[:4], inner[4:])
+    return jnp.stack([*rotation_wxyz, *(a + b for a, b in zip(outer[4:], moved, strict=True))])
+
+
+def _components_last(parts: jax.Array) -> jax.Array:
+    return jnp.moveaxis(parts, (1, 0), (-2, -1))
 
 
 def points(poses: BodyPoses, body: np.ndarray, offset: np.ndarray) -> jax.Array:
     """World positions ``[..., n, 3]`` of points at ``offset [n, 3]`` (m) in the bodies ``body [n]``."""
-    return poses.position[..., body, :] + rotations.rotate(
-        poses.rotation_wxyz[..., body, :], jnp.asarray(offset, poses.position.dtype)
-    )
+    rotation_wxyz, origin = (jnp.moveaxis(x, (-2, -1), (1, 0))[:, body] for x in (poses.rotation_wxyz, poses.position))
+    there = offset.T.reshape(3, len(body), *[1] * (origin.ndim - 2)).astype(origin.dtype)
+    moved = rotations.rotated(rotation_wxyz, there)
+    return _components_last(jnp.stack([a + b for a, b in zip(origin, moved, strict=True)]))
 
 
 def key_points(robot: Robot, poses: BodyPoses) -> jax.Array:

@@ -19,6 +19,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # where MJX, which Brax imports
     from brax.training.types import UInt64
 
 from fmpjax import sharding
+from fmpjax.acting import Policy
 from fmpjax.config import PPOConfig
 
 
@@ -52,7 +53,7 @@ class PPO:
     def __init__(self, observation_size: int, action_size: int, config: PPOConfig):
         self.config = config
         self.observation_size, self.action_size = observation_size, action_size
-        activation = getattr(linen, config.activation)
+        activation = elu if config.activation == "elu" else getattr(linen, config.activation)
         initializers = jax.nn.initializers
         # Otherwise uniform within 1 / sqrt(inputs), PyTorch's way.
         uniform = initializers.variance_scaling(1 / 3, "fan_in", "uniform")
@@ -115,16 +116,18 @@ class PPO:
         mean, deviation = self._policy.apply(normalizer, actor, observation)
         return mean, deviation if self.config.learn_deviation else jax.lax.stop_gradient(deviation)
 
-    def act(self, state: PPOState, deterministic: bool = False):
+    def act(self, state: PPOState, deterministic: bool = False) -> Policy:
         """The policy as the environment calls it."""
 
-        def policy(observation, key):
-            parameters = self.policy(state.actor, state.normalizer, observation)
-            mean, deviation = parameters
-            action = mean if deterministic else self._distribution.sample(parameters, key)
+        def draw(key, shape):
+            return key if deterministic else jax.random.normal(key, (*shape, self.action_size))
+
+        def act(observation, noise):
+            mean, deviation = self.policy(state.actor, state.normalizer, observation)
+            action = mean if deterministic else mean + deviation * noise
             return action, {"mean": mean, "deviation": deviation}
 
-        return policy
+        return Policy(act, draw)
 
     def value(self, state: PPOState, observation: jax.Array) -> jax.Array:
         """Value estimates ``[...]``."""
@@ -234,12 +237,35 @@ class PPO:
             stats = stats | {"loss": value, "gradient_norm": norm, "skipped": (~finite).astype(jnp.float32)}
             return carry, stats
 
-        order = jax.vmap(lambda k: jax.random.permutation(k, count))(jax.random.split(key, epochs))
+        order = jax.vmap(lambda k: permutation(k, count))(jax.random.split(key, epochs))
         order = order.reshape(epochs * minibatches, -1)
         (params, optimizer_state), stats = jax.lax.scan(descend, (params, optimizer_state), order)
         summary = {name: values[-minibatches:].mean() for name, values in stats.items()}
         summary["skipped"] = stats["skipped"].sum()
         return params, optimizer_state, summary
+
+
+@jax.custom_jvp
+def elu(x: jax.Array) -> jax.Array:
+    """Exponential linear unit; its derivative comes from its value, so the exponential is taken once."""
+    return jnp.where(x > 0, x, jnp.exp(jnp.minimum(x, 0.0)) - 1.0)
+
+
+@elu.defjvp
+def _elu_jvp(primals, tangents):
+    y = elu(*primals)
+    return y, tangents[0] * jnp.where(y > 0, 1.0, y + 1.0)
+
+
+def permutation(key: jax.Array, count: int) -> jax.Array:
+    """A random order of ``count`` rows, by one sort of random numbers whose last bits are the rows.
+
+    `jax.random.permutation` sorts pairs, and twice. Rows that share their random bits, one in five of 32,768, keep the
+    order among themselves that they have in the rollout.
+    """
+    bits = (count - 1).bit_length()
+    drawn = jax.random.bits(key, (count,)) >> bits << bits
+    return (jnp.sort(drawn | jnp.arange(count, dtype=jnp.uint32)) & (2**bits - 1)).astype(jnp.int32)
 
 
 def generalized_advantage(

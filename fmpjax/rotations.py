@@ -16,17 +16,18 @@ def _library(x):
 
 def multiply(a_wxyz, b_wxyz):
     """Hamilton product of two quaternions, ``[..., 4]``."""
-    xp = _library(a_wxyz)
-    aw, ax, ay, az = (a_wxyz[..., i] for i in range(4))
-    bw, bx, by, bz = (b_wxyz[..., i] for i in range(4))
-    return xp.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
+    a, b = (tuple(q[..., i] for i in range(4)) for q in (a_wxyz, b_wxyz))
+    return _library(a_wxyz).stack(multiplied(a, b), axis=-1)
+
+
+def multiplied(a_wxyz, b_wxyz):
+    """The same of components: four arrays each, and the product's four."""
+    (aw, ax, ay, az), (bw, bx, by, bz) = a_wxyz, b_wxyz
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
     )
 
 
@@ -37,10 +38,19 @@ def conjugate(q_wxyz):
 
 def rotate(q_wxyz, v):
     """Rotate vectors ``v [..., 3]`` by ``q_wxyz [..., 4]``."""
-    xp = _library(q_wxyz)
-    w, u = q_wxyz[..., :1], q_wxyz[..., 1:]
-    t = 2.0 * xp.cross(u, v)
-    return v + w * t + xp.cross(u, t)
+    q, v = tuple(q_wxyz[..., i] for i in range(4)), tuple(v[..., i] for i in range(3))
+    return _library(q_wxyz).stack(rotated(q, v), axis=-1)
+
+
+def rotated(q_wxyz, v):
+    """The same of components: four arrays and three, and the rotated vector's three."""
+    (w, x, y, z), (a, b, c) = q_wxyz, v
+    s, t, u = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return (
+        a + w * s + (y * u - z * t),
+        b + w * t + (z * s - x * u),
+        c + w * u + (x * t - y * s),
+    )
 
 
 def exp_map(v):

@@ -58,6 +58,7 @@ class Trainer:
         self.prior_map = self.feature_map.unclipped() if priors.normalizes(config.method) else self.feature_map
         self.prior_expert = self.expert._replace(windows=self.prior_map(windows))
         self.prior = priors.make(config.method, self.prior_expert, config)
+        self._init = jax.jit(self._first)  # one program: compiled one by one, its operations take seconds
 
     @property
     def clip(self) -> MotionClip:
@@ -73,9 +74,13 @@ class Trainer:
 
     def init(self, seed: int | None = None) -> TrainState:
         """The state at iteration zero, a function of the seed, by default the configuration's."""
-        seed = self.config.seed if seed is None else seed
-        key, ppo_key, prior_key, env_key = jax.random.split(jax.random.PRNGKey(seed), 4)
-        state = TrainState(
+        state = self._init(jax.random.PRNGKey(self.config.seed if seed is None else seed))
+        # A compiled chunk is given its state's buffers to write into, so no two leaves may share one.
+        return jax.tree.map(jnp.copy, state)
+
+    def _first(self, key: jax.Array) -> TrainState:
+        key, ppo_key, prior_key, env_key = jax.random.split(key, 4)
+        return TrainState(
             ppo=self.ppo.init(ppo_key, self.env.clip_observations),
             prior=self.prior.init(prior_key),
             env=self.env.reset(env_key),
@@ -83,8 +88,6 @@ class Trainer:
             iteration=jnp.int32(0),
             nonfinite=jnp.int32(0),
         )
-        # A compiled chunk is given its state's buffers to write into, so no two leaves may share one.
-        return jax.tree.map(jnp.copy, state)
 
     def iteration(self, state: TrainState, _=None) -> tuple[TrainState, Metrics]:
         """Roll out, fit the reward and score with it, improve the policy."""

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 from typing import NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ import pytest
 
 from fmpjax import env as environments
 from fmpjax import features, motion, physics, robots
+from fmpjax.acting import Policy
 from fmpjax.config import preset
 from fmpjax.env import Env
 
@@ -55,7 +57,7 @@ def policy_of(low, high):
         first = jax.random.uniform(jax.random.fold_in(key, 1), (len(observation),), minval=low, maxval=high)
         return action.at[:, 0].set(first), {"mean": action, "deviation": jnp.ones_like(action)}
 
-    return policy
+    return Policy(policy)
 
 
 ROBOT = robots.load("unitree_g1")
@@ -460,3 +462,18 @@ def test_actions_reach_the_physics_through_the_map():
     action = jax.random.uniform(jax.random.PRNGKey(0), (COUNT, JOINTS), minval=-3, maxval=3)
     sim, _, _ = built.advance(built.reset(jax.random.PRNGKey(1)).physics, action)
     np.testing.assert_array_equal(sim.qpos[:, 7:], environments.action_map(ROBOT, CLIP, "residual")(action))
+
+
+def test_a_step_launches_few_kernels():
+    """A launch costs microseconds, whatever it computes: a step of 575 was a fifth of an iteration."""
+    native = Env(ROBOT, CLIP, preset("laptop"), physics.make(ROBOT, preset("laptop").physics))
+    state = jax.eval_shape(native.reset, jax.random.PRNGKey(0))
+    policy = Policy(lambda observation, noise: (noise, {}), lambda key, shape: jax.random.normal(key, (*shape, JOINTS)))
+
+    def launches(steps):
+        program = jax.jit(lambda state, key: native.rollout(state, policy, key, steps))
+        text = program.lower(state, jax.random.PRNGKey(0)).compile().as_text()
+        loop = max(re.split(r"\n\n", text), key=lambda computation: computation.count("ffi_call"))
+        return len(re.findall(r" (?:fusion|copy|concatenate|dot|custom-call|while|call)\(", loop))
+
+    assert launches(4) <= 80

@@ -1,0 +1,25 @@
+"""How actions are chosen: the interface between whoever learns and the environment."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+
+
+def _keep(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    return key
+
+
+class Policy(NamedTuple):
+    """A stochastic policy, its random numbers apart, so that a rollout draws those of all its steps at once.
+
+    ``act(observation [N, O], drawn) -> action [N, J], extras``: normalised actions and what to remember of them, each
+    ``[N, ...]``. ``draw(key, (N,)) -> drawn``: the random numbers of one step; the key itself unless told otherwise.
+    """
+
+    act: Callable[[jax.Array, Any], tuple[jax.Array, dict[str, jax.Array]]]
+    draw: Callable[[jax.Array, tuple[int, ...]], Any] = _keep
+
+    def __call__(self, observation: jax.Array, key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Draw and act: one step."""
+        return self.act(observation, self.draw(key, observation.shape[:-1]))
