@@ -478,7 +478,7 @@ def video(
     rate = trainer.config.control_rate
     stride = 2  # 25 pictures a second
     episode = _longest(played)
-    last = int(seconds * rate)
+    last = min(int(seconds * rate), len(played.qpos))
     shown = {"policy": played.qpos[: min(last, int(played.length[episode])) : stride, episode]}
     if not alone:
         shown["demonstration"] = trainer.library.clips[played.clip[episode]].qpos[:last:stride]
