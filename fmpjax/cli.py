@@ -273,8 +273,9 @@ class Export:
         for path in runs.export(run, self.out, onnx=self.onnx):
             print(f"wrote {path}")
         config = run.config
-        if self.onnx and (sentence := deploy.unmeasured(robots.load(config.robot), config.env.observation)):
-            print(f"note: {sentence}")
+        for say in (deploy.unmeasured, deploy.no_stock) if self.onnx else ():
+            if sentence := say(robots.load(config.robot), config.env.observation):
+                print(f"note: {sentence}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,14 +7,15 @@ our own; docs/deploy.md lists them. A list is text with commas, its inner lists 
 
 import importlib.util
 import json
-from collections.abc import Iterable
+import shutil
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import fmpjax
-from fmpjax import features
+from fmpjax import features, sim2sim
 from fmpjax.config import Config
 from fmpjax.errors import UserError
 from fmpjax.motion import bundled
@@ -27,6 +28,16 @@ _UNMEASURED = {
     "root_linear_velocity": "the root's linear velocity",
     "key_points": "the places of key points",
 }
+# Parts of the observation that Unitree's stock program for the G1 makes (and `gait_phase`, which fmpjax does not have).
+STOCK = "base_ang_vel projected_gravity velocity_commands joint_pos joint_pos_rel joint_vel_rel last_action".split()
+_LEG = "hip_pitch hip_roll hip_yaw knee ankle_pitch ankle_roll".split()
+_ARM = "shoulder_pitch shoulder_roll shoulder_yaw elbow wrist_roll wrist_pitch wrist_yaw".split()
+# The G1's motors in the order of Unitree's SDK.
+SDK_JOINTS = [
+    *(f"{side}_{part}_joint" for side in ("left", "right") for part in _LEG),
+    *(f"waist_{part}_joint" for part in ("yaw", "roll", "pitch")),
+    *(f"{side}_{part}_joint" for side in ("left", "right") for part in _ARM),
+]
 
 
 class Origin(NamedTuple):
@@ -37,6 +48,9 @@ class Origin(NamedTuple):
     motions: tuple[tuple[str, float], ...]  # names and weights
     commit: str | None  # of the program that trained it
     evaluation: dict[str, Any] | None  # what evaluation.json says
+    changed: bool = False  # whether the program had changes that the commit does not have
+    # Of a policy that takes velocities as commands: low and high of lin_vel_x, lin_vel_y (m/s) and ang_vel_z (rad/s).
+    commands: Mapping[str, tuple[float, float]] | None = None
 
 
 def check_installed() -> None:
@@ -61,11 +75,24 @@ def unmeasured(robot: Robot, observation: str) -> str | None:
     )
 
 
+def no_stock(robot: Robot, observation: str) -> str | None:
+    """A sentence on why Unitree's stock program cannot run a policy; None where it can."""
+    if sorted(robot.joint_names) != sorted(SDK_JOINTS):
+        return f"no params/deploy.yaml: {robot.name} has not the 29 joints of Unitree's program for the G1"
+    unknown = [name for name in features.observation_terms(robot, observation) if name not in STOCK]
+    if not unknown:
+        return None
+    return f"no params/deploy.yaml: Unitree's program does not know the observation {', '.join(unknown)}"
+
+
 def write(folder: Path, policy: Policy, robot: Robot, origin: Origin) -> list[Path]:
     """Write ``policy.onnx`` and ``MODEL_CARD.md`` into ``folder``; the paths written.
 
+    Where Unitree's stock program can run the policy, ``params/deploy.yaml`` and ``exported/policy.onnx``, too, where
+    that program looks for them.
+
     Raises:
-      UserError: the widths of observation, layers and joints do not fit together.
+      UserError: the widths of observation, layers and joints do not fit together, or a number is not finite.
     """
     import onnx
 
@@ -76,11 +103,57 @@ def write(folder: Path, policy: Policy, robot: Robot, origin: Origin) -> list[Pa
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, folder / "policy.onnx")
     (folder / "MODEL_CARD.md").write_text(card(policy, robot, origin))
-    return [folder / "policy.onnx", folder / "MODEL_CARD.md"]
+    paths = [folder / "policy.onnx", folder / "MODEL_CARD.md"]
+    if no_stock(robot, policy.observation) is None:
+        for path in (exported := folder / "exported" / "policy.onnx", settings := folder / "params" / "deploy.yaml"):
+            path.parent.mkdir(exist_ok=True)
+        settings.write_text(stock(policy, robot, origin))
+        shutil.copy2(folder / "policy.onnx", exported)
+        paths += [exported, settings]
+    return paths
+
+
+def stock(policy: Policy, robot: Robot, origin: Origin) -> str:
+    """The settings with which Unitree's stock program runs the policy, YAML.
+
+    Raises:
+      UserError: the policy takes commands, and nobody says from which ranges.
+    """
+    terms = features.observation_terms(robot, policy.observation)
+    if "velocity_commands" in terms and origin.commands is None:
+        raise UserError("the policy takes commands of no known range: expected lin_vel_x, lin_vel_y and ang_vel_z")
+    commands = {name: list(span) for name, span in (origin.commands or {}).items()}
+    action = {
+        "clip": np.stack([policy.low, policy.high], -1).astype(float).tolist(),
+        "joint_names": list(policy.joint_names),
+        "scale": _plain(policy.scale),
+        "offset": _plain(policy.center),
+        "joint_ids": None,
+    }
+    settings = {
+        "joint_ids_map": [SDK_JOINTS.index(name) for name in policy.joint_names],
+        "step_dt": 1.0 / policy.rate,
+        "stiffness": _plain(robot.stiffness),
+        "damping": _plain(robot.damping),
+        "default_joint_pos": _plain(policy.center),
+        "commands": {"base_velocity": {"ranges": commands | {"heading": None}}} if commands else {},
+        "actions": {"JointPositionAction": action},
+        "observations": {
+            name: {"params": {}, "clip": None, "scale": [1.0] * width, "history_length": 1}
+            for name, width in terms.items()
+        },
+    }
+    # YAML takes JSON for values.
+    return "".join(f"{key}: {json.dumps(value)}\n" for key, value in settings.items())
+
+
+def _plain(values: np.ndarray) -> list[float]:
+    """Python's numbers, of as many digits as the array's type has."""
+    return [float(str(value)) for value in values]
 
 
 def check_widths(policy: Policy, terms: dict[str, int]) -> None:
-    """Refuse a policy whose parts do not fit together.
+    """Refuse a policy whose parts do not fit together or are not finite.
 
     Raises:
       UserError: they do not.
@@ -98,6 +171,10 @@ def check_widths(policy: Policy, terms: dict[str, int]) -> None:
                 f"the policy's {name} has {width} numbers: expected {wanted}, "
                 f"as {joints} joints and the {policy.observation!r} observation make it"
             )
+    for name, value in policy._asdict().items():
+        arrays = value if name in ("kernels", "biases") else [value] if isinstance(value, np.ndarray) else []
+        if not all(np.isfinite(array).all() for array in arrays):
+            raise UserError(f"the policy's {name} are not finite: expected numbers")
 
 
 def graph(policy: Policy):
@@ -146,7 +223,10 @@ def graph(policy: Policy):
 
 def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
     """What the file says of itself, text by key."""
-    terms = features.observation_terms(robot, policy.observation)
+    terms, physics = features.observation_terms(robot, policy.observation), origin.config.physics
+    # As `fmpjax.physics` steps it, whatever the file of the robot says.
+    trained = robot.physics_model(frictionloss=physics.frictionloss)
+    facts = sim2sim.facts(trained, policy.joint_names)
     mjlab = {
         "run_path": origin.run,
         "joint_names": _list(policy.joint_names),
@@ -154,10 +234,10 @@ def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
         "joint_damping": _list(robot.damping),
         # mjlab's runners add this to the scaled action, so it is the action's offset and not the initial pose.
         "default_joint_pos": _list(policy.center),
-        "command_names": "",
+        "command_names": "" if origin.commands is None else "base_velocity",
         "observation_names": _list(terms),
         "observation_terms_scale": _list([1.0] * len(terms)),
-        "observation_terms_flatten_history_dim": _list([True] * len(terms)),
+        "observation_terms_flatten_history_dim": _list([1] * len(terms)),  # truth is a number in mjlab's text
         "observation_terms_history_length": _list([0] * len(terms)),
         "observation_terms_clip": _list(["-inf;inf"] * len(terms)),
         "action_scale": _list(policy.scale),
@@ -184,14 +264,20 @@ def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
             ]
         ),
         "step_dt": str(1.0 / policy.rate),
-        "physics_dt": str(origin.config.physics.timestep),
+        "physics_dt": str(physics.timestep),
+        "integrator": sim2sim.integrator(trained),
+        **{name: _list(";".join(map(str, np.ravel(row))) for row in rows) for name, rows in facts.items()},
         "total_mass": str(robot.total_mass),
         "robot": robot.name,
         "method": origin.config.method,
         "motions": _list(Path(name).name for name, _ in origin.motions),
-        "commit": origin.commit or "unknown",
+        "commit": _commit(origin),
         "fmpjax_version": fmpjax.__version__,
     }
+
+
+def _commit(origin: Origin) -> str:
+    return (origin.commit or "unknown") + (" with changes" if origin.changed else "")
 
 
 def _list(values: Iterable[Any]) -> str:
@@ -226,6 +312,10 @@ At most {transitions:,} transitions, reset `{reset}`, physics at {physics_rate:g
 
 {evaluation}
 
+## Robustness
+
+{robustness}
+
 ## Observation
 
 `obs` has {size} numbers, not normalized:
@@ -254,6 +344,13 @@ _MEANING = {
     "joint_rotation_6d": "x axis and z axis of each joint's rotation, in the order of the joints",
     "joint_velocity": "rad/s, in the order of the joints",
     "key_points": "of {points}: place less the root's, in the world's axes, m",
+    "base_ang_vel": "of the root, in its own axes, rad/s",
+    "projected_gravity": "where gravity points, a unit vector in the root's axes",
+    "velocity_commands": "wanted velocity forward and to the left, m/s, and turn, rad/s",
+    "joint_pos": "angles, rad, in the order of the joints",
+    "joint_pos_rel": "angles less the offset of the action, rad, in the order of the joints",
+    "joint_vel_rel": "rad/s, in the order of the joints",
+    "last_action": "`actions` of the step before, zero at the start",
 }
 
 
@@ -275,7 +372,7 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
         description=robot.description,
         method=config.method,
         version=fmpjax.__version__,
-        commit=origin.commit or "unknown",
+        commit=_commit(origin),
         preset=config.preset,
         rate=policy.rate,
         unmeasured="" if sentence is None else sentence[0].upper() + sentence[1:] + ".",
@@ -284,6 +381,7 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
         physics_rate=1.0 / config.physics.timestep,
         motions="\n".join(f"| {Path(name).name} | {weight:g} | {_license(name)} |" for name, weight in origin.motions),
         evaluation=_evaluated(origin.evaluation),
+        robustness=_robustness(origin.evaluation),
         size=start,
         observation="\n".join(rows),
         joints=len(policy.joint_names),
@@ -308,4 +406,21 @@ def _evaluated(figures: dict[str, Any] | None) -> str:
     return (
         f"In simulation, on the model it was trained on: {figures['falls']} falls in {figures['episodes']} first "
         f"episodes, late speed {speed('late_speed')}, of the demonstration {speed('demonstration_speed')}."
+    )
+
+
+def _robustness(figures: dict[str, Any] | None) -> str:
+    starts = (figures or {}).get("starts") or []
+    rows = [f"| {start['noise']:g} | {start['falls']} | {start['episodes']} |" for start in starts]
+    if not rows:
+        return "No disturbance was tried."
+    return "\n".join(
+        [
+            "Falls by the noise of the joint angles at the start, rad; ten times that, rad/s, of their velocities. "
+            "Pushes, delays and other floors were not tried.",
+            "",
+            "| noise | falls | first episodes |",
+            "|---|---|---|",
+            *rows,
+        ]
     )

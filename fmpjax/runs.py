@@ -494,6 +494,7 @@ def _origin(run: Run) -> deploy.Origin:
         motions=tuple(run.motions(run.config)),
         commit=run.provenance().get("commit"),
         evaluation=evaluation,
+        changed=bool(run.provenance().get("uncommitted_changes")),
     )
 
 
