@@ -361,6 +361,8 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
     rows, start = [], 0
     for name, width in features.observation_terms(robot, policy.observation).items():
         meaning = _MEANING[name].format(points=", ".join(robot.key_point_names))
+        if name == "joint_rotation_6d" and robot.jointless_row is not None:
+            meaning += f", with a row that is always 1, 0, 0, 0, 0, 1 before joint {robot.jointless_row}"
         rows.append(f"| {start} | {start + width - 1} | `{name}` | {meaning} |")
         start += width
     numbers = zip(
@@ -398,7 +400,7 @@ def _license(motion: str) -> str:
 
 def _evaluated(figures: dict[str, Any] | None) -> str:
     if figures is None:
-        return "The policy was not evaluated."
+        return "The run has no evaluation of this policy; `fmpjax evaluate` makes one."
 
     def speed(name: str) -> str:
         return "undefined" if figures.get(name) is None else f"{figures[name]:.3f} m/s"
@@ -413,7 +415,7 @@ def _robustness(figures: dict[str, Any] | None) -> str:
     starts = (figures or {}).get("starts") or []
     rows = [f"| {start['noise']:g} | {start['falls']} | {start['episodes']} |" for start in starts]
     if not rows:
-        return "No disturbance was tried."
+        return "No disturbance was tried on this policy."
     return "\n".join(
         [
             "Falls by the noise of the joint angles at the start, rad; ten times that, rad/s, of their velocities. "

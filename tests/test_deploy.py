@@ -151,13 +151,13 @@ def test_the_card_says_licenses_evaluation_and_what_is_not_measured(robot, walk)
     card = deploy.card(made.policy, robot, made.origin)
     assert "| walk | 1 | MIT, bundled with fmpjax |" in card
     assert "| secret.csv | 0.5 | unknown: ask the motion's source |" in card
-    assert "The policy was not evaluated." in card
+    assert "The run has no evaluation of this policy" in card
     assert deploy.unmeasured(robot, "compact") in card.replace("The policy observes", "the policy observes")
     assert all(f"| `{joint}` |" in card for joint in robot.joint_names)
     figures = {"falls": 3, "episodes": 64, "late_speed": None, "demonstration_speed": 0.8578}
     card = deploy.card(made.policy, robot, made.origin._replace(evaluation=figures))
     assert "3 falls in 64 first episodes, late speed undefined, of the demonstration 0.858 m/s" in card
-    assert "No disturbance was tried." in card
+    assert "No disturbance was tried on this policy." in card
     figures["starts"] = [{"noise": 0.0, "falls": 0, "episodes": 1}, {"noise": 0.01, "falls": 7, "episodes": 21}]
     card = deploy.card(made.policy, robot, made.origin._replace(evaluation=figures, changed=True))
     assert "| 0 | 0 | 1 |\n| 0.01 | 7 | 21 |\n" in card and "commit abc123 with changes" in card
