@@ -52,8 +52,8 @@ render: run-is-named $(READY) ## render a run's policy as a video: RUN=runs/walk
 	$(BIN)/fmpjax render '$(RUN)' $(ARGS)
 
 # A file of tests at a time to each of two processes: most of the time is XLA's compiling, which uses one core.
-# Warp runs on a CPU too: its tests need it, training does without its 150 MB.
-test: $(READY) $(VENV)/.warp ## run every test, in WORKERS processes (2)
+# Warp runs on a CPU too: its tests need it, training does without its 150 MB. So it is with ONNX Runtime.
+test: $(READY) $(VENV)/.extras ## run every test, in WORKERS processes (2)
 	$(BIN)/python -m pytest -n $(or $(WORKERS),2) --dist loadfile $(or $(ARGS),-m 'not alone')
 	$(if $(ARGS),,$(BIN)/python -m pytest -m alone)
 
@@ -100,6 +100,6 @@ $(READY): pyproject.toml constraints.txt
 	@$(install) '.[dev,viz,retarget]'
 	@touch $@
 
-$(VENV)/.warp: $(READY)
-	@$(install) '.[warp]'
+$(VENV)/.extras: $(READY)
+	@$(install) '.[warp,deploy]'
 	@touch $@

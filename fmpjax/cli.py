@@ -14,6 +14,7 @@ import tyro
 import fmpjax
 from fmpjax import config as configuration
 from fmpjax import shell
+from fmpjax.cli_deploy import Sim2Sim
 from fmpjax.cli_motion import MOTION
 from fmpjax.errors import UserError
 from fmpjax.shell import default
@@ -261,12 +262,20 @@ class Export:
     """Folder of the run."""
     out: tyro.conf.Positional[Path]
     """Folder to write."""
+    onnx: bool = False
+    """Write policy.onnx and MODEL_CARD.md, too, for other programs; docs/deploy.md."""
 
     def __call__(self) -> None:
         runs = _runs()
+        from fmpjax import deploy, robots
 
-        for path in runs.export(runs.Run.open(self.run), self.out):
+        run = runs.Run.open(self.run)
+        for path in runs.export(run, self.out, onnx=self.onnx):
             print(f"wrote {path}")
+        config = run.config
+        for say in (deploy.unmeasured, deploy.no_stock) if self.onnx else ():
+            if sentence := say(robots.load(config.robot), config.env.observation):
+                print(f"note: {sentence}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -357,7 +366,7 @@ COMMANDS = shell.Group(
     "Flow-Matched Motion Priors in JAX. `fmpjax --version` prints the version.",
     {
         "train": Train, "evaluate": Evaluate, "diagnose": Diagnose, "render": Render, "export": Export,
-        "report": Report, "motion": MOTION, "config": ShowConfig, "list": List,
+        "sim2sim": Sim2Sim, "report": Report, "motion": MOTION, "config": ShowConfig, "list": List,
     },
 )  # fmt: skip
 

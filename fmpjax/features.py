@@ -165,6 +165,15 @@ def observe(robot: Robot, qpos: jax.Array, qvel: jax.Array, observation: str) ->
     return Observed(actor, frame, kinematics.fallen(robot, poses))
 
 
+def observation_terms(robot: Robot, observation: str) -> dict[str, int]:
+    """Names and widths of the parts of the policy's observation, in the order in which `observe` puts them."""
+    joints = robot.joint_count
+    rows = joints + (robot.jointless_row is not None)
+    angles = {"joint_rotation_6d": 6 * rows} if observation == "full" else {"joint_position": joints}
+    root = {"root_height": 1, "root_rotation_6d": 6, "root_linear_velocity": 3, "root_angular_velocity": 3}
+    return root | angles | {"joint_velocity": joints, "key_points": 3 * len(robot.key_body)}
+
+
 def frame_size(robot: Robot) -> int:
     """Numbers in a full frame of the prior, 239 for the G1."""
     rows = robot.joint_count + (robot.jointless_row is not None)

@@ -5,13 +5,15 @@ and computes with the array library of its first argument, so the same code serv
 device.
 """
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 
 def _library(x):
-    return jnp if isinstance(x, jax.Array) else np
+    if isinstance(x, np.ndarray | np.generic):
+        return np
+    import jax  # whoever has its arrays has imported it; commands without them start without it
+
+    return jax.numpy if isinstance(x, jax.Array) else np
 
 
 def multiply(a_wxyz, b_wxyz):

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from fmpjax import config as configuration
-from fmpjax import diagnose, evaluate, jsons, memory, motion, policy, robots, sharding, shell
+from fmpjax import deploy, diagnose, evaluate, jsons, memory, motion, policy, robots, sharding, shell
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import Config
 from fmpjax.errors import UserError, out_of_memory
@@ -443,12 +443,19 @@ _EXPORTED = (
 ).split()
 
 
-def export(run: Run, out: Path) -> list[Path]:
+def export(run: Run, out: Path, *, onnx: bool = False) -> list[Path]:
     """Copy what a run has to show, and its policy, without states and demonstration, into ``out``; the paths written.
 
+    With ``onnx`` the policy is also written for other programs, as `fmpjax.deploy` does it.
+
     Raises:
-      UserError: ``out`` holds another run's results, or cannot be written.
+      UserError: ``out`` holds another run's results, or cannot be written, or there is no policy for ``onnx``.
     """
+    trained = bool(run.checkpoints.iterations() or run.checkpoints.iterations(best=True))
+    if onnx:
+        deploy.check_installed()
+        if not trained:
+            raise UserError(f"run {run.folder} has no checkpoint: expected one, of which --onnx takes the policy")
     if out.resolve() == run.folder.resolve():
         raise UserError(f"{out} is the run itself: expected another folder")
     # Where the demonstration and the run lay is this machine's affair; their names are everybody's.
@@ -463,12 +470,32 @@ def export(run: Run, out: Path) -> list[Path]:
         for n, text in texts.items():
             write(out / n, text)
         copied = [Path(shutil.copy2(run.folder / n, out / n)) for n in _EXPORTED if (run.folder / n).exists()]
-        if run.checkpoints.iterations() or run.checkpoints.iterations(best=True):
+        if trained:
             trainer, state = run.policy()
-            copied.append(policy.save(out / "policy.npz", policy.of(trainer, state.ppo)))
+            learned = policy.of(trainer, state.ppo)
+            copied.append(policy.save(out / "policy.npz", learned))
+            if onnx:
+                copied += deploy.write(out, learned, trainer.robot, _origin(run))
         return [*(out / n for n in texts), *copied]
     except OSError as error:
         raise UserError(f"folder {out} cannot be written: {error.strerror}") from None
+
+
+def _origin(run: Run) -> deploy.Origin:
+    """Where the run's policy comes from, as its ONNX file and its card say."""
+    path = run.folder / "evaluation.json"
+    try:
+        evaluation = json.loads(path.read_text()) if path.exists() else None
+    except ValueError:
+        raise UserError(f"{path} is not valid JSON: expected what `fmpjax evaluate` writes") from None
+    return deploy.Origin(
+        run=run.folder.resolve().name,
+        config=run.config,
+        motions=tuple(run.motions(run.config)),
+        commit=run.provenance().get("commit"),
+        evaluation=evaluation,
+        changed=bool(run.provenance().get("uncommitted_changes")),
+    )
 
 
 def video(

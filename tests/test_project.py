@@ -29,7 +29,10 @@ def test_every_requirement_is_imported_and_pinned():
     pinned = {line.partition("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines()}
     code = "\n".join(path.read_text() for path in (ROOT / "fmpjax").rglob("*.py"))
     optional = project["optional-dependencies"]
-    for requirement in [*project["dependencies"], *optional["viz"], *optional["retarget"]]:
+    for requirement in [
+        *project["dependencies"],
+        *(r for extra in ("viz", "retarget", "deploy") for r in optional[extra]),
+    ]:
         name = _name(requirement)
         module = IMPORTED_AS.get(name, re.match(r"[A-Za-z0-9-]+", requirement)[0])
         imported = re.search(rf"^\s*(import|from) {module}\b|import_module\(\"{module}\"\)", code, re.MULTILINE)

@@ -59,7 +59,7 @@ def test_every_command_has_a_sentence_and_no_default_is_none(shown, program):
         sentences[path] = sentence
         assert re.fullmatch(r"[A-Z`].*\.", sentence, re.DOTALL), (path, sentence)
         assert "None" not in text, (path, text)
-        commands = re.search(r"\{([a-z_,-]+)\}\s*$", usage)
+        commands = re.search(r"\{([a-z0-9_,-]+)\}\s*$", usage)
         for name in commands[1].split(",") if commands else ():
             paths.append((*path, name))
             assert re.search(rf"^\W+{name} +[A-Z]", tables, re.MULTILINE), (path, name, tables)

@@ -1,0 +1,55 @@
+"""The command `fmpjax sim2sim`."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from fmpjax.errors import UserError
+from fmpjax.shell import default
+
+
+@dataclasses.dataclass(frozen=True)
+class Sim2Sim:
+    """Run an exported policy on another MuJoCo model of its robot, with ONNX Runtime."""
+
+    policy: tyro.conf.Positional[Path]
+    """policy.onnx, as `fmpjax export --onnx` writes it."""
+    model: Path
+    """MJCF file with the policy's joints."""
+    seconds: float = 10.0
+    """Length of an episode at most, of a policy that takes no commands."""
+    episodes: int = 8
+    """Starts from the default pose, all but the first with joints a little off."""
+    gains: Literal["policy", "model"] = "policy"
+    """Whose gains the servos have: the policy's, or those of the model, which then needs position servos."""
+    course: Annotated[tuple[str, ...], default("a walk, a turn and a stop")] = ()
+    """What a policy that takes commands is told, as SECONDS:FORWARD,LEFT,TURN in m/s and rad/s, leg after leg."""
+    video: Annotated[Path | None, default("no video")] = None
+    """Film the first episode: a file .mp4, or .gif where no encoder is installed."""
+
+    def __call__(self) -> None:
+        from fmpjax import robots, sim2sim
+
+        if not 0 < self.seconds < math.inf:
+            raise UserError(f"--seconds is {self.seconds:g}: expected a number above 0")
+        if self.episodes < 1:
+            raise UserError(f"--episodes is {self.episodes}: expected at least 1")
+        if self.video is not None and self.video.suffix not in (".mp4", ".gif"):
+            raise UserError(f"--video is {self.video}: expected a name that ends in .mp4 or .gif")
+        course = sim2sim.course(self.course)
+        policy = sim2sim.load(self.policy)
+        # The robot of the training stands in the video for the model, whose looks may be missing.
+        robot = None if self.video is None else robots.load(policy.robot)
+        if not course and "velocity_commands" in policy.terms:
+            course = sim2sim.COURSE
+        simulation = sim2sim.Simulation(policy, self.model, own_gains=self.gains == "model")
+        played = sim2sim.play(simulation, seconds=self.seconds, episodes=self.episodes, course=course)
+        print(sim2sim.report(simulation, played, course))
+        if robot is not None:
+            from fmpjax.viz import render
+
+            frames = render.render_frames(robot, played[0].qpos[::2], labels="sim2sim")
+            print(f"wrote {render.write_video(self.video, frames, fps=0.5 / policy.step_dt)}")
