@@ -102,7 +102,7 @@ class Trainer:
         # Devices split the windows as the prior does, by rows of the rollout: indices travel, windows do not.
         windows = self.prior_map(self.env.frame_table(state.env, steps)[sharding.gather(steps.window)])
         prior, reward, prior_metrics = self.prior.update(
-            state.prior, priors.Rollout(windows, ~steps.nonfinite), prior_key
+            state.prior, priors.Rollout(windows, ~steps.nonfinite, steps.length == 1), prior_key
         )
         ppo, ppo_metrics = self.ppo.update(state.ppo, _batch(steps, reward), ppo_key)
         skipped = prior_metrics.get("skipped", 0.0) + ppo_metrics["skipped"]

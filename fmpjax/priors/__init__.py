@@ -2,7 +2,7 @@
 
 from fmpjax.config import Config
 from fmpjax.errors import UserError
-from fmpjax.priors import amp, barycentric, empirical, flow
+from fmpjax.priors import amp, barycentric, empirical, flow, gail, pwil, smp, wail
 from fmpjax.priors.base import Expert, MotionPrior, Reward, Rollout, couple, median_reward
 
 _REGISTRY = {
@@ -12,9 +12,14 @@ _REGISTRY = {
     "bank16": empirical.make,
     "barycentric": barycentric.make,
     "amp": amp.make,
+    "gail": gail.make,
+    "wail": wail.make,
+    "pwil": pwil.make,
+    "smp": smp.make,
 }
 METHODS = tuple(_REGISTRY)
-_OWN_NORMALIZER = ("amp",)
+PAPER = ("fmp", "endpoint", "value", "bank16", "barycentric", "amp")  # those of the paper's Table I
+_OWN_NORMALIZER = ("amp", "gail", "wail")
 _POTENTIALS = ("fmp", "endpoint", "value")
 
 
@@ -52,6 +57,7 @@ def check(method: str) -> None:
 
 __all__ = [
     "METHODS",
+    "PAPER",
     "Expert",
     "MotionPrior",
     "Reward",
