@@ -51,6 +51,11 @@ class EnvConfig:
     observation: str = "full"  # "full": 237 numbers [P]; "compact": 86 that carry the same information [D]
     action: str = "absolute"  # 1.4 max|limit| around zero [M], or "residual": 0.25 effort/kp around the mean [D]
 
+    @property
+    def longest_episode(self) -> int:
+        """Control steps of the longest episode in training."""
+        return max(self.first_cap, min(self.last_cap, self.episode_steps))
+
 
 @dataclasses.dataclass(frozen=True)
 class FeatureConfig:
@@ -122,7 +127,7 @@ class GAILConfig(AdversaryConfig):
     """The discriminator of ``method=gail``: AMP's network."""
 
     replay: int = 0  # none: the opponent is the present policy [D]
-    gradient_penalty: float = 0.0  # 0 or 10, in AMP's form [A]
+    gradient_penalty: float = 0.0  # 0 or 10 [A]; in AMP's form [D]
     logit_penalty: float = 0.0  # none [A]
     optimizer: str = "adam"  # [A]
     learning_rate: float = 1e-5  # [A]
@@ -164,8 +169,9 @@ class SMPConfig:
     learning_rate: float = 1e-4  # AdamW [S]
     weight_decay: float = 0.01  # of AdamW [D: its usual one]
     clip_norm: float = 1.0  # gradient-norm clip [S]
-    average: float = 0.995  # factor of the parameter average per iteration; the average scores [S]
+    average: float = 0.995  # factor of the parameter average; the average scores [S, there once in ten iterations]
     score_steps: tuple[int, ...] = (22, 15, 8)  # noise steps at which windows are scored [S]
+    score_batch: int = 4096  # windows scored side by side, which bounds the memory that this takes [S]
     decay: float = 6.0  # of the reward with the error relative to its running mean [S]
     error_floor: float = 1e-4  # least running mean of the error [S]
     mean_samples: float = 5e7  # windows after which that running mean stays [S, its G1 variant]
@@ -496,7 +502,7 @@ _POSITIVE = (
     "amp.minibatch amp.replay amp.replay_new amp.learning_rate gail.updates gail.minibatch gail.replay_new "
     "gail.learning_rate wail.updates wail.minibatch wail.replay_new wail.learning_rate wail.deviation_half_life "
     "wail.deviation_floor pwil.scale pwil.decay smp.noise_steps smp.iterations smp.batch smp.learning_rate "
-    "smp.clip_norm smp.decay smp.error_floor smp.mean_samples"
+    "smp.clip_norm smp.decay smp.error_floor smp.mean_samples smp.score_batch"
 ).split()
 
 

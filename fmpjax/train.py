@@ -44,7 +44,8 @@ class Trainer:
         for clip in self.library.clips:
             _check(clip, self.robot, config)
         self.env = Env(self.robot, self.library, config, physics.make(self.robot, config.physics))
-        self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo)
+        clock = config.env.longest_episode if priors.remembers(config.method) else 0
+        self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo, clock)
         windows, share = self.env.clip_windows(), self.env.window_share()
         self.feature_map = features.fit_feature_map(self.robot, windows, config.features, share)
         self.expert = priors.Expert(
@@ -193,6 +194,7 @@ def _batch(steps: Steps, reward: jax.Array) -> Batch:
         reward=reward,
         fell=steps.fell,
         timed_out=steps.timed_out,
+        age=steps.length,
     )
 
 

@@ -76,6 +76,7 @@ def test_wail_critic_between_two_points_has_slope_one():
     values = np.asarray(prior.score(state, jnp.linspace(-0.4, 0.4, 5)[:, None]))
     np.testing.assert_allclose(np.diff(values) / 0.4, 1.1, atol=0.05)  # steps of 0.2 / 0.5
     assert float(metrics["critic_slope"]) == pytest.approx(1.1, abs=0.02)
+    assert float(metrics["critic_difference"]) == pytest.approx(2.2, abs=0.05)  # slope times L
 
 
 def test_wail_reward_does_not_depend_on_the_critics_level_and_divides_by_a_running_deviation():
@@ -158,17 +159,35 @@ def test_pwil_takes_as_many_atoms_as_it_needs():
     mass, costs = jnp.full((1, 3), 1 / 3), []
     for point in points:
         distance = jnp.sqrt(2 * transport.squared_cost(jnp.asarray(point[None]), jnp.asarray(atoms)))
-        cost, mass = pwil.couple(distance, mass, 1 / 3 - 0.01)
+        cost, mass, _ = pwil.couple(distance, mass, 1 / 3 - 0.01)
         costs.append(float(cost[0]))
     np.testing.assert_allclose(5 * np.exp(-15 * np.array(costs)), expected, rtol=1e-4)
     np.testing.assert_allclose(mass[0], [0.0, 0.0, 0.03], atol=1e-6)
 
 
 def test_pwil_ends_where_the_demonstration_is_spent():
-    """A step that asks for more than is left takes what there is."""
-    cost, mass = pwil.couple(jnp.array([[1.0, 2.0], [1.0, 2.0]]), jnp.array([[0.1, 0.1], [0.5, 0.5]]), 0.5)
+    """A step that asks for more than is left takes what there is, and says how much is missing."""
+    cost, mass, left = pwil.couple(jnp.array([[1.0, 2.0], [1.0, 2.0]]), jnp.array([[0.1, 0.1], [0.5, 0.5]]), 0.5)
     np.testing.assert_allclose(cost, [0.3, 0.5], rtol=1e-6)
     np.testing.assert_allclose(mass, [[0, 0], [0, 0.5]], atol=1e-7)
+    np.testing.assert_allclose(left, [0.3, 0.0], atol=1e-7)
+
+
+def test_pwil_rewards_no_step_for_which_too_little_is_left():
+    """Standing on the only atom earns 5 for each of the eight steps of the longest episode, and then nothing."""
+    config = dataclasses.replace(SMALL, env=dataclasses.replace(SMALL.env, count=1, first_cap=STEPS, last_cap=STEPS))
+    prior = priors.make("pwil", expert_of(np.zeros((1, 2))), config)
+    start = jnp.arange(STEPS + 2)[:, None] == 0
+    rollout = Rollout(jnp.zeros((STEPS + 2, 1, 2)), jnp.ones_like(start), start)
+    _, reward, metrics = prior.update(prior.init(None), rollout, None)
+    np.testing.assert_allclose(reward[:, 0], [5.0] * STEPS + [0.0] * 2, atol=1e-5)
+    assert float(metrics["mass_held"]) >= 0
+
+
+def test_the_critic_has_a_clock_where_the_reward_remembers_the_episode():
+    settings = {"env.first_cap": 5, "env.last_cap": 40, "env.episode_steps": 30}
+    clocks = {name: Trainer(tiny(method=name, **settings), motion.load("walk")).ppo.clock for name in ("fmp", "pwil")}
+    assert clocks == {"fmp": 0, "pwil": 30}
 
 
 def test_pwil_refuses_what_it_cannot_couple():

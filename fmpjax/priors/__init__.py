@@ -20,6 +20,7 @@ _REGISTRY = {
 METHODS = tuple(_REGISTRY)
 PAPER = ("fmp", "endpoint", "value", "bank16", "barycentric", "amp")  # those of the paper's Table I
 _OWN_NORMALIZER = ("amp", "gail", "wail")
+_REMEMBERS = ("pwil",)
 _POTENTIALS = ("fmp", "endpoint", "value")
 
 
@@ -41,6 +42,11 @@ def descriptions() -> dict[str, str]:
 def normalizes(method: str) -> bool:
     """Whether the prior called ``method`` normalises windows itself, and so takes them unclipped."""
     return method in _OWN_NORMALIZER
+
+
+def remembers(method: str) -> bool:
+    """Whether the reward of a window depends on what its episode did before, so that the critic needs a clock."""
+    return method in _REMEMBERS
 
 
 def check_potential(method: str) -> None:
@@ -69,4 +75,5 @@ __all__ = [
     "make",
     "median_reward",
     "normalizes",
+    "remembers",
 ]

@@ -4,7 +4,7 @@ Every episode has the demonstration's windows as atoms of equal mass. A step mov
 that still have some, and what it took is gone until the episode ends. The reward falls with the distance that the mass
 moved. Only windows are compared, not actions. They are FMP's features, standardized by its deviations.
 
-The reward depends on the episode's past, which the policy and its critic do not observe.
+The reward depends on the episode's past. The critic is told how much of the longest episode is over; the policy is not.
 """
 
 from typing import NamedTuple
@@ -24,12 +24,16 @@ class PWILState(NamedTuple):
     mass: jax.Array  # [N, W]
 
 
-def couple(distance: jax.Array, mass: jax.Array, step: jax.Array | float) -> tuple[jax.Array, jax.Array]:
-    """Move ``step`` of mass to the nearest atoms: sums of mass times distance ``[N]``, and what is left, ``[N, W]``.
+def couple(distance: jax.Array, mass: jax.Array, step: jax.Array | float) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Move ``step`` of mass to the nearest atoms.
 
     Args:
       distance: ``[N, W]`` to each atom.
       mass: ``[N, W]`` that the atoms hold.
+
+    Returns:
+      Sums of mass times distance ``[N]``; what the atoms still hold, ``[N, W]``; what found no place, ``[N]``, which is
+      0 unless all atoms are empty.
     """
     rows = jnp.arange(len(mass))
 
@@ -41,18 +45,17 @@ def couple(distance: jax.Array, mass: jax.Array, step: jax.Array | float) -> tup
         carry = cost + taken * distance[rows, nearest], mass.at[rows, nearest].add(-taken), left
         return *carry, (left > 0) & (taken > 0)
 
-    # Earlier steps leave remainders in many atoms, so no fixed number of rounds is enough.
+    # Earlier steps leave remainders in many atoms, so W / T + 1 rounds are not enough. Each round empties an atom or
+    # ends, so there are at most W + 1.
     full = jnp.full(len(mass), step, mass.dtype)
     start = (jnp.zeros_like(full), mass, full, jnp.ones(len(mass), bool))
-    cost, mass, _, _ = jax.lax.while_loop(lambda carry: carry[-1].any(), take, start)
-    return cost, mass
+    return jax.lax.while_loop(lambda carry: carry[-1].any(), take, start)[:3]
 
 
 def make(expert: Expert, config: Config) -> MotionPrior:
     """Primal Wasserstein Imitation Learning: each episode's greedy coupling to the demonstration, with no network."""
     settings, windows = config.pwil, expert.windows
-    # The longest episode of training.
-    steps = max(config.env.first_cap, min(config.env.last_cap, config.env.episode_steps))
+    steps = config.env.longest_episode
     step_mass = 1.0 / steps - settings.slack
     if step_mass <= 0:
         raise UserError(
@@ -87,15 +90,16 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         def step(mass, inputs):
             x, start = inputs
             mass = jnp.where(start[:, None], full, mass)
-            cost, mass = couple(distances(x), mass, step_mass)
-            return mass, (cost, mass.sum(-1))
+            cost, mass, left = couple(distances(x), mass, step_mass)
+            return mass, (cost, left, mass.sum(-1))
 
-        mass, (cost, held) = jax.lax.scan(
+        mass, (cost, left, held) = jax.lax.scan(
             step, sharding.split(state.mass), (sharding.split(features, axis=1), rollout.start)
         )
         scores = exponent(cost)
         reward = settings.scale * jnp.exp(scores)
-        reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
+        # A step that finds too little mass earns nothing: what it moved does not tell how far off it is.
+        reward = jnp.where(rollout.valid & (left == 0) & jnp.isfinite(reward), reward, 0.0)
         low, middle, high = jnp.quantile(scores, jnp.array([0.25, 0.5, 0.75]))
         summary = {
             "score_median": middle,

@@ -5,7 +5,8 @@ run that resumes does not pretrain again. The reward falls with the error of the
 window, relative to the mean error of the policy's windows so far.
 
 Where this departs from the source: windows are FMP's, with joint velocities and at the control rate, standardized by
-FMP's deviations, and ``smp.network`` may be ``small``. Coordinates that stand twice in the full window count once.
+FMP's deviations, and ``smp.network`` may be ``small``. Coordinates that stand twice in the full window count once. The
+running mean includes the rollout that is scored.
 """
 
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ import numpy as np
 import optax
 from flax import linen
 
+from fmpjax import sharding
 from fmpjax.config import SMP_NETWORKS, Config
 from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten, step_if_finite
 
@@ -130,12 +132,18 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         return jax.lax.while_loop(lambda carry: carry[0].iteration < settings.iterations, step, (state, jnp.int32(0)))
 
     def errors(state: SMPState, x, key):
-        """Errors ``[K, n]`` at each noise step of features ``[n, D]``, one noise for all steps."""
-        noise = jax.random.normal(key, x.shape)
+        """Errors ``[K, n]`` at each noise step of features ``[n, D]``, each step with a noise of its own."""
         denoise = lambda y, step: network.apply(state.average, y, step)  # noqa: E731
-        return jax.lax.map(
-            lambda step: denoising_error(denoise, x / expert.weight, noise, step, left[step]), score_steps
-        )
+
+        def at(inputs):
+            step, key = inputs
+
+            def one(window, noise):
+                return denoising_error(denoise, window[None] / expert.weight, noise[None], step, left[step])[0]
+
+            return sharding.spread(one, settings.score_batch)(x, jax.random.normal(key, x.shape))
+
+        return jax.lax.map(at, (score_steps, jax.random.split(key, len(score_steps))))
 
     def exponent(state: SMPState, error):
         """Logarithm of the reward, ``[n]``, of errors ``[K, n]``."""
