@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from fmpjax import priors, transport
+from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import AMPConfig, Config, EnvConfig, GAILConfig, PriorConfig, SMPConfig, WAILConfig
 from fmpjax.priors import Expert, Rollout, adversary, amp, barycentric, empirical
+from fmpjax.train import TrainState
 
 STEPS, COUNT = 8, 32  # of a rollout
 SMALL = Config(
@@ -44,8 +46,8 @@ def cloud():
 
 
 @pytest.mark.parametrize("method", priors.METHODS)
-def test_every_prior_keeps_the_contract(cloud, method):
-    """Shapes, finite rewards, 0 where a window is not valid, a function of its key alone, state that stays a state."""
+def test_every_prior_keeps_the_contract(cloud, method, tmp_path):
+    """Shapes, finite rewards, 0 where a window is not valid, a function of its key alone, a state that can be saved."""
     expert, points = cloud
     if method == "barycentric":
         expert = expert_of(jnp.tile(expert.windows, (1, 2)), horizon=2)
@@ -71,6 +73,9 @@ def test_every_prior_keeps_the_contract(cloud, method):
     np.testing.assert_array_equal(again[1], reward)
     scores = prior.score(new, rollout_of(np.nan_to_num(points)).features.reshape(STEPS * COUNT, -1))
     assert scores.shape == (STEPS * COUNT,)
+    run = TrainState(None, new, None, jax.random.PRNGKey(2), jnp.int32(1), jnp.int32(0))
+    Checkpoints(tmp_path).save(run)
+    jax.tree.map(np.testing.assert_array_equal, Checkpoints(tmp_path).restore(run), run)
 
 
 # --- nested ablations ------------------------------------------------------------------------------------------------

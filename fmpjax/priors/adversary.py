@@ -40,7 +40,7 @@ class State(NamedTuple):
     params: Any
     optimizer: optax.OptState
     normalizer: Normalizer
-    replay: Replay
+    replay: Replay | None  # None where the settings ask for no replay: a checkpoint holds no empty array
 
 
 class Network(linen.Module):
@@ -157,7 +157,9 @@ def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
     def init(key):
         params = network.init(key, jnp.zeros((1, size)))
         normalizer = Normalizer(jnp.float32(0.0), jnp.zeros(size), jnp.ones(size))
-        replay = Replay(jnp.zeros((settings.replay, size), jnp.float16), jnp.int32(0), jnp.int32(0))
+        replay = None
+        if settings.replay:
+            replay = Replay(jnp.zeros((settings.replay, size), jnp.float16), jnp.int32(0), jnp.int32(0))
         return State(params, optimizer.init(params), normalizer, replay)
 
     def score(state: State, x):
@@ -165,7 +167,7 @@ def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
 
     def fit(state: State, pool, scores, key):
         order_key, seen_key, replay_key, store_key = jax.random.split(key, 4)
-        replay = store(state.replay, pool, settings.replay_new, store_key) if settings.replay else state.replay
+        replay = store(state.replay, pool, settings.replay_new, store_key) if settings.replay else None
 
         def step(carry, inputs):
             params, optimizer_state = carry
