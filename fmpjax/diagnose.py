@@ -406,9 +406,19 @@ RULES = (
         "`train/reward_spread`",
         lambda course: course["train/reward_spread"],
         Range(low=0.08),
-        ("prior.temperature", "amp.gradient_penalty", "method"),
-        "`table1/barycentric-fixed-seed0`, which stands, 0.04; AMP walks at 0.20",
-        methods=("amp", "barycentric"),
+        ("prior.temperature", "amp.gradient_penalty", "wail.gradient_penalty", "method"),
+        "`table1/barycentric-fixed-seed0`, which stands, 0.04; AMP walks at 0.20; no course is of WAIL",
+        methods=("amp", "barycentric", "wail"),
+    ),
+    Rule(
+        "reward flat, in its logarithm",
+        "The reward is flat: whatever the policy does earns about the same share of the most that it can",
+        "`fit/score_spread`",
+        lambda course: course["fit/score_spread"],
+        Range(low=0.1),
+        ("pwil.decay", "smp.decay", "smp.iterations", "method"),
+        "half of the rewards are within a tenth of each other; no course is of these methods",
+        methods=("pwil", "smp"),
     ),
     Rule(
         "scores tie",
@@ -428,11 +438,11 @@ RULES = (
         Range(low=0.1),
         (
             *("prior.endpoint_weight", "prior.flow_weight", "amp.gradient_penalty", "gail.gradient_penalty"),
-            *("wail.updates", "method"),
+            *("wail.updates", "smp.iterations", "method"),
         ),
         "`table1/value-fixed-seed0` −40, `table1/fixed_pose/value-fixed-seed1` −26; the bundled walks, the least of "
         "those that walk, 0.34 to 0.54",
-        methods=(*_CENTERED, "amp", "gail", "wail"),
+        methods=(*_CENTERED, "amp", "gail", "wail", "smp"),
     ),
     Rule(
         "discriminator saturated",

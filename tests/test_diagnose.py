@@ -94,6 +94,11 @@ BOUNDS = [
         dict(method="amp", train_reward_spread=0.08),
         dict(method="barycentric", train_reward_spread=0.07),
     ),
+    (
+        "reward flat, in its logarithm",
+        dict(method="pwil", fit_score_spread=0.1),
+        dict(method="smp", fit_score_spread=0.09),
+    ),
     ("scores tie", dict(fit_score_spread=0.003), dict(fit_score_spread=0.0029)),
     ("margin negative", dict(fit_expert_margin=0.1), dict(fit_expert_margin=-1.0)),
     (
