@@ -58,7 +58,7 @@ def test_every_prior_keeps_the_contract(cloud, method, tmp_path):
     points = points.reshape(STEPS, COUNT, -1).copy()
     points[2, 5] = np.nan
     update = jax.jit(prior.update)
-    state = prior.init(jax.random.PRNGKey(0))
+    state = jax.jit(prior.init)(jax.random.PRNGKey(0))
     new, reward, metrics = update(state, rollout_of(points, valid), jax.random.PRNGKey(1))
     assert reward.shape == (STEPS, COUNT)
     assert np.isfinite(reward).all()
@@ -71,7 +71,7 @@ def test_every_prior_keeps_the_contract(cloud, method, tmp_path):
     assert jax.tree.all(jax.tree.map(same, new, state))
     again = update(state, rollout_of(points, valid), jax.random.PRNGKey(1))
     np.testing.assert_array_equal(again[1], reward)
-    scores = prior.score(new, rollout_of(np.nan_to_num(points)).features.reshape(STEPS * COUNT, -1))
+    scores = jax.jit(prior.score)(new, rollout_of(np.nan_to_num(points)).features.reshape(STEPS * COUNT, -1))
     assert scores.shape == (STEPS * COUNT,)
     run = TrainState(None, new, None, jax.random.PRNGKey(2), jnp.int32(1), jnp.int32(0))
     Checkpoints(tmp_path).save(run)

@@ -123,14 +123,14 @@ def greedy(features, starts, atoms, steps, slack=1e-6, scale=5.0, decay=5.0):
                     cost + moved * distance[atom],
                     taken + 1,
                 )
-        rewards.append(scale * math.exp(-decay * steps * cost))
+        rewards.append(scale * math.exp(-decay * steps * cost) if left <= 0 else 0.0)
         most = max(most, taken)
     return np.array(rewards), most
 
 
 @pytest.mark.parametrize("atoms", [5, 8, 30])
 def test_pwil_is_the_greedy_coupling_of_each_episode(atoms):
-    """Episodes of at most eight steps that start anywhere, over two rollouts, against the definition."""
+    """Episodes that start anywhere, over two rollouts, against the definition; one is longer than the mass lasts."""
     rng = np.random.default_rng(atoms)
     config = dataclasses.replace(SMALL, env=dataclasses.replace(SMALL.env, count=4, first_cap=4, last_cap=STEPS))
     windows = 0.3 * rng.normal(size=(atoms, 2))

@@ -232,11 +232,13 @@ def test_value_of_a_reward_that_only_the_clock_tells():
     ppo = PPO(1, 1, PROBE, clock=STEPS)
     last = jnp.broadcast_to((jnp.arange(STEPS) == STEPS - 1)[:, None], (STEPS, COUNT))
     age = jnp.broadcast_to(1 + jnp.arange(STEPS)[:, None], (STEPS, COUNT))
-    env, update = probe(1.0, last, following=1.0, reward=1.0 * last), jax.jit(ppo.update)
-    state = ppo.init(jax.random.PRNGKey(0))
-    for seed in range(150):
-        key = jax.random.PRNGKey(seed)
-        state, _ = update(state, batch_of(ppo, state, key, env)._replace(age=age), key)
+    env = probe(1.0, last, following=1.0, reward=1.0 * last)
+
+    def one(state, key):
+        return ppo.update(state, batch_of(ppo, state, key, env)._replace(age=age), key)[0], None
+
+    keys = jax.random.split(jax.random.PRNGKey(1), 150)
+    state, _ = jax.jit(lambda state: jax.lax.scan(one, state, keys))(ppo.init(jax.random.PRNGKey(0)))
     over = jnp.arange(STEPS)
     np.testing.assert_allclose(ppo.value(state, jnp.ones((STEPS, 1)), over), 0.5 ** (7 - over), atol=0.1)
 
