@@ -38,7 +38,7 @@ def main() -> None:
     windows = jax.jit(lambda s, r: trainer.feature_map(env.frame_table(s.env, r)[r.window]))
     improve = jax.jit(lambda s, r, reward, k: ppo.update(s.ppo, _batch(r, reward), k))
     _, record = rollout(state, key)
-    seen = priors.Rollout(windows(state, record), ~record.nonfinite)
+    seen = priors.Rollout(windows(state, record), ~record.nonfinite, record.length == 1)
     pool = seen.features.reshape(-1, seen.features.shape[-1])
     calls = {
         "rollout": lambda: rollout(state, key),

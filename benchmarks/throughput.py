@@ -223,7 +223,7 @@ def parts(trainer, state, seeds: int) -> dict[str, Part]:
     keys = jax.random.split(jax.random.PRNGKey(0), seeds) if seeds > 1 else jax.random.PRNGKey(0)
     play = over(lambda s, k: env.rollout(s.env, ppo.act(s.ppo), k, trainer.config.ppo.rollout_steps)[1])
     look = over(lambda s, r: trainer.feature_map(env.frame_table(s.env, r)[r.window]))
-    fit = over(lambda s, f, r, k: prior.update(s.prior, priors.Rollout(f, ~r.nonfinite), k)[1])
+    fit = over(lambda s, f, r, k: prior.update(s.prior, priors.Rollout(f, ~r.nonfinite, r.length == 1), k)[1])
     score = over(lambda s, f: prior.score(s.prior, f.reshape(-1, f.shape[-1])))
     improve = over(lambda s, r, reward, k: ppo.update(s.ppo, _batch(r, reward), k)[0])
     made = {"physics": physics_alone(trainer, state), "rollout": part(play, state, keys)}

@@ -1,6 +1,7 @@
 """Every number of the method, once, with its source.
 
-Sources: [P] the paper; [M] MimicKit, the code base the paper builds on; [D] decided here where both are silent. The
+Sources: [P] the paper; [M] MimicKit, the code base the paper builds on; of the other priors [A] acme's GAIL, [W] WAIL
+(arXiv 1906.08113), [L] PWIL (arXiv 2006.04678), [S] SMP in MimicKit; [D] decided here where these are silent. The
 defaults of the dataclasses are the paper's; `PRESETS` says where ``smoke`` and ``laptop`` depart from them and why.
 """
 
@@ -50,6 +51,11 @@ class EnvConfig:
     observation: str = "full"  # "full": 237 numbers [P]; "compact": 86 that carry the same information [D]
     action: str = "absolute"  # 1.4 max|limit| around zero [M], or "residual": 0.25 effort/kp around the mean [D]
 
+    @property
+    def longest_episode(self) -> int:
+        """Control steps of the longest episode in training."""
+        return max(self.first_cap, min(self.last_cap, self.episode_steps))
+
 
 @dataclasses.dataclass(frozen=True)
 class FeatureConfig:
@@ -90,8 +96,8 @@ class PriorConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class AMPConfig:
-    """The discriminator of ``method=amp``."""
+class AdversaryConfig:
+    """What the adversarial priors share, with AMP's numbers."""
 
     hidden: tuple[int, ...] = (1024, 512)  # ReLU layers [M]
     logit_init: float = 1.0  # the logit layer's weights are uniform in this range [M]
@@ -107,7 +113,75 @@ class AMPConfig:
     weight_decay: float = 1e-4  # [M]
     normalizer_clip: float = 10.0  # normalised coordinates are clipped to this magnitude [M]
     normalizer_floor: float = 1e-4  # least standard deviation of a coordinate [M]
+
+
+@dataclasses.dataclass(frozen=True)
+class AMPConfig(AdversaryConfig):
+    """The discriminator of ``method=amp``."""
+
     least_probability: float = 1e-4  # caps the reward at -2 log of it [M]
+
+
+@dataclasses.dataclass(frozen=True)
+class GAILConfig(AdversaryConfig):
+    """The discriminator of ``method=gail``: AMP's network."""
+
+    replay: int = 0  # none: the opponent is the present policy [D]
+    gradient_penalty: float = 0.0  # 0 or 10 [A]; in AMP's form [D]
+    logit_penalty: float = 0.0  # none [A]
+    optimizer: str = "adam"  # [A]
+    learning_rate: float = 1e-5  # [A]
+    weight_decay: float = 0.0  # none [A]
+
+
+@dataclasses.dataclass(frozen=True)
+class WAILConfig(AdversaryConfig):
+    """The critic of ``method=wail``: AMP's network."""
+
+    updates: int = 5  # two to five in a rollout [W]
+    replay: int = 0  # none: the distance is to the present policy [D]
+    gradient_penalty: float = 10.0  # weight of (slope - 1)^2 at random interpolates [W]
+    logit_penalty: float = 0.0  # none: the slope is bounded already [W]
+    optimizer: str = "adam"  # [W]
+    learning_rate: float = 1e-4  # [D: WGAN-GP's]
+    weight_decay: float = 0.0  # none [D]
+    deviation_half_life: float = 16.0  # rollouts, of the running deviation that the reward divides by [D]
+    deviation_floor: float = 1e-3  # least such deviation [D]
+
+
+@dataclasses.dataclass(frozen=True)
+class PWILConfig:
+    """The greedy coupling of ``method=pwil``."""
+
+    scale: float = 5.0  # alpha, the reward of a perfect step [L]
+    decay: float = 5.0  # beta, of the reward with the distance [L]
+    slack: float = 1e-6  # mass that a step lacks of 1 / T, so that the demonstration's never runs out [L]
+
+
+@dataclasses.dataclass(frozen=True)
+class SMPConfig:
+    """The diffusion model of ``method=smp``."""
+
+    network: str = "published"  # "published" [S] or "small", see `SMP_NETWORKS`
+    noise_steps: int = 50  # DDPM steps, squared-cosine schedule [S]
+    iterations: int = 50_000  # of pretraining, all in the first update of a run [S]
+    batch: int = 512  # windows in each [S]
+    learning_rate: float = 1e-4  # AdamW [S]
+    weight_decay: float = 0.01  # of AdamW [D: its usual one]
+    clip_norm: float = 1.0  # gradient-norm clip [S]
+    average: float = 0.995  # factor of the parameter average; the average scores [S, there once in ten iterations]
+    score_steps: tuple[int, ...] = (22, 15, 8)  # noise steps at which windows are scored [S]
+    score_batch: int = 4096  # windows scored side by side, which bounds the memory that this takes [S]
+    decay: float = 6.0  # of the reward with the error relative to its running mean [S]
+    error_floor: float = 1e-4  # least running mean of the error [S]
+    mean_samples: float = 5e7  # windows after which that running mean stays [S, its G1 variant]
+
+
+# Transformer layers, heads, numbers a head.
+SMP_NETWORKS = {
+    "published": (2, 4, 64),  # [S]
+    "small": (1, 2, 32),  # a thirtieth of the arithmetic, for a CPU [D]
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,6 +241,10 @@ class Config:
     features: FeatureConfig = FeatureConfig()
     prior: PriorConfig = PriorConfig()
     amp: AMPConfig = AMPConfig()
+    gail: GAILConfig = GAILConfig()
+    wail: WAILConfig = WAILConfig()
+    pwil: PWILConfig = PWILConfig()
+    smp: SMPConfig = SMPConfig()
     ppo: PPOConfig = PPOConfig()
 
     @property
@@ -205,7 +283,10 @@ class Config:
 # - Adam with a rate that follows the KL divergence and a critic's loss in units of the return's variance, a gradient
 #   clip, small networks (ELU, orthogonal), five epochs of both, learned deviation: sample efficiency. No bound penalty:
 #   a residual that is too large is clipped at the joint's range;
-# - AMP with Adam, a smaller network and replay, and as many updates and samples in each as the potential has.
+# - AMP with Adam, a smaller network and replay, and as many updates and samples in each as the potential has; GAIL and
+#   WAIL with the same network and samples; GAIL with as many updates and AMP's rate, since 1e-5 hardly moves in so few;
+# - SMP with a smaller network, fewer and smaller iterations and the larger rate that these allow: pretraining takes
+#   seconds to minutes instead of hours on two cores. It is not the published prior, and `smp.network` says so.
 _LAPTOP: dict[str, Any] = {
     "robot": "unitree_g1",
     "precision": "default",
@@ -237,6 +318,16 @@ _LAPTOP: dict[str, Any] = {
     "amp.replay": 40_000,
     "amp.optimizer": "adam",
     "amp.learning_rate": 1e-4,
+    "gail.hidden": (256, 128),
+    "gail.updates": 3,
+    "gail.minibatch": 256,
+    "gail.learning_rate": 1e-4,
+    "wail.hidden": (256, 128),
+    "wail.minibatch": 256,
+    "smp.network": "small",
+    "smp.iterations": 2000,
+    "smp.batch": 128,
+    "smp.learning_rate": 1e-3,
     "ppo.hidden": (256, 128),
     "ppo.activation": "elu",
     "ppo.orthogonal": True,
@@ -272,6 +363,14 @@ _SMOKE: dict[str, Any] = _LAPTOP | {
     "amp.updates": 2,
     "amp.minibatch": 64,
     "amp.replay": 1000,
+    "gail.hidden": (64, 64),
+    "gail.updates": 2,
+    "gail.minibatch": 64,
+    "wail.hidden": (64, 64),
+    "wail.updates": 2,
+    "wail.minibatch": 64,
+    "smp.iterations": 20,
+    "smp.batch": 32,
     "ppo.hidden": (64, 64),
 }
 
@@ -385,6 +484,9 @@ _CHOICES = {
     "features.axes": ("world", "heading"),
     "env.action": ("absolute", "residual"),
     "amp.optimizer": ("sgd", "adam"),
+    "gail.optimizer": ("sgd", "adam"),
+    "wail.optimizer": ("sgd", "adam"),
+    "smp.network": tuple(SMP_NETWORKS),
     "physics.backend": ("auto", "native", "mjx"),
     "physics.impl": ("jax", "warp"),
     "ppo.optimizer": ("sgd", "adam"),
@@ -397,7 +499,10 @@ _POSITIVE = (
     "features.deviation_floor features.angular_velocity_floor features.clip prior.bank prior.minibatch "
     "prior.updates prior.learning_rate ppo.learning_rate ppo.deviation chunk evaluation_episodes "
     "prior.spread_floor prior.value_scale env.last_cap prior.score_banks prior.temperature amp.updates "
-    "amp.minibatch amp.replay amp.replay_new amp.learning_rate"
+    "amp.minibatch amp.replay amp.replay_new amp.learning_rate gail.updates gail.minibatch gail.replay_new "
+    "gail.learning_rate wail.updates wail.minibatch wail.replay_new wail.learning_rate wail.deviation_half_life "
+    "wail.deviation_floor pwil.scale pwil.decay smp.noise_steps smp.iterations smp.batch smp.learning_rate "
+    "smp.clip_norm smp.decay smp.error_floor smp.mean_samples smp.score_batch"
 ).split()
 
 
@@ -410,7 +515,10 @@ def validate(config: Config) -> Config:
     for key in _POSITIVE:
         if not flat[key] > 0:
             raise UserError(f"setting {key} is {flat[key]}: expected more than 0")
-    for key in ("prior.parallel_solves", "physics.threads", "env.reset_noise"):
+    for key in (
+        "prior.parallel_solves physics.threads env.reset_noise gail.replay gail.gradient_penalty wail.replay "
+        "wail.gradient_penalty pwil.slack smp.weight_decay"
+    ).split():
         if flat[key] < 0:
             raise UserError(f"setting {key} is {flat[key]}: expected 0 or more")
     noise = config.evaluation_noise
@@ -423,6 +531,14 @@ def validate(config: Config) -> Config:
     for key in ("ppo.discount", "ppo.gae_lambda", "prior.query_share"):
         if not 0 < flat[key] <= 1:
             raise UserError(f"setting {key} is {flat[key]}: expected a number in (0, 1]")
+    if not 0 <= config.smp.average < 1:
+        raise UserError(f"setting smp.average is {config.smp.average}: expected a number in [0, 1)")
+    steps = config.smp.score_steps
+    if not steps or not all(0 <= step < config.smp.noise_steps for step in steps):
+        raise UserError(
+            f"setting smp.score_steps is {', '.join(map(str, steps)) or 'empty'}: expected noise steps from 0 to "
+            f"{config.smp.noise_steps - 1}, below smp.noise_steps"
+        )
     if not 0 <= config.seed < 2**32:
         raise UserError(f"setting seed is {config.seed}: expected 0 to {2**32 - 1}")
     if not 2 <= config.features.history <= 64:

@@ -35,6 +35,7 @@ SETTLED = {"dataset": 0.5, "fixed": 0.7}
 _POTENTIALS = ("fmp", "endpoint", "value")
 _CENTERED = (*_POTENTIALS, "bank16")  # the reward is divided by the score's spread
 _TRANSPORTS = (*_CENTERED, "barycentric")
+_SECTIONS = ("prior", "amp", "gail", "wail", "pwil", "smp")  # settings of a reward; transports share "prior"
 
 
 class Missing(KeyError):
@@ -158,7 +159,8 @@ def _reads(method: str, setting: str) -> bool:
     """Whether the reward reads the setting, or it is not one of a reward."""
     if setting in _READ_BY:
         return method in _READ_BY[setting]
-    return (method == "amp") == setting.startswith("amp.") if setting.startswith(("amp.", "prior.")) else True
+    section = setting.partition(".")[0]
+    return section not in _SECTIONS or section == (method if method in _SECTIONS else "prior")
 
 
 def _fallen(course: Course) -> float:
@@ -404,9 +406,19 @@ RULES = (
         "`train/reward_spread`",
         lambda course: course["train/reward_spread"],
         Range(low=0.08),
-        ("prior.temperature", "amp.gradient_penalty", "method"),
-        "`table1/barycentric-fixed-seed0`, which stands, 0.04; AMP walks at 0.20",
-        methods=("amp", "barycentric"),
+        ("prior.temperature", "amp.gradient_penalty", "wail.gradient_penalty", "method"),
+        "`table1/barycentric-fixed-seed0`, which stands, 0.04; AMP walks at 0.20; no course is of WAIL",
+        methods=("amp", "barycentric", "wail"),
+    ),
+    Rule(
+        "reward flat, in its logarithm",
+        "The reward is flat: whatever the policy does earns about the same share of the most that it can",
+        "`fit/score_spread`",
+        lambda course: course["fit/score_spread"],
+        Range(low=0.1),
+        ("pwil.decay", "smp.decay", "smp.iterations", "method"),
+        "half of the rewards are within a tenth of each other; no course is of these methods",
+        methods=("pwil", "smp"),
     ),
     Rule(
         "scores tie",
@@ -424,10 +436,13 @@ RULES = (
         "`fit/expert_margin`",
         lambda course: course["fit/expert_margin"],
         Range(low=0.1),
-        ("prior.endpoint_weight", "prior.flow_weight", "amp.gradient_penalty", "method"),
+        (
+            *("prior.endpoint_weight", "prior.flow_weight", "amp.gradient_penalty", "gail.gradient_penalty"),
+            *("wail.updates", "smp.iterations", "method"),
+        ),
         "`table1/value-fixed-seed0` −40, `table1/fixed_pose/value-fixed-seed1` −26; the bundled walks, the least of "
         "those that walk, 0.34 to 0.54",
-        methods=(*_CENTERED, "amp"),
+        methods=(*_CENTERED, "amp", "gail", "wail", "smp"),
     ),
     Rule(
         "discriminator saturated",
@@ -436,10 +451,13 @@ RULES = (
         "`fit/discriminator_loss`",
         lambda course: course["fit/discriminator_loss"],
         Range(low=0.05),
-        ("amp.gradient_penalty", "amp.learning_rate", "amp.updates"),
-        "0.24 to 0.41 at the ends, no row under 0.11; an accuracy of 1 alone is no fault: `table1/amp-fixed-seed0` "
-        "walks with it",
-        methods=("amp",),
+        (
+            *("amp.gradient_penalty", "amp.learning_rate", "amp.updates"),
+            *("gail.gradient_penalty", "gail.learning_rate", "gail.updates"),
+        ),
+        "AMP is at 0.24 to 0.41 at the ends, no row under 0.11; an accuracy of 1 alone is no fault: "
+        "`table1/amp-fixed-seed0` walks with it; no course is of GAIL",
+        methods=("amp", "gail"),
     ),
     Rule(
         "fit unconverged",
@@ -487,9 +505,9 @@ RULES = (
         "`fit/skipped`, per rollout",
         lambda course: course["fit/skipped"],
         Range(high=0.0),
-        ("prior.learning_rate", "amp.learning_rate"),
+        tuple(f"{section}.learning_rate" for section in ("prior", "amp", "gail", "wail", "smp")),
         "0 in every row of every course",
-        methods=(*_POTENTIALS, "amp"),
+        methods=(*_POTENTIALS, "amp", "gail", "wail", "smp"),
     ),
     Rule(
         "policy updates skipped",

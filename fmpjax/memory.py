@@ -6,7 +6,7 @@ On an accelerator nothing is estimated: its allocator refuses with an error, of 
 import jax
 
 from fmpjax import features, machine, robots
-from fmpjax.config import Config
+from fmpjax.config import SMP_NETWORKS, AdversaryConfig, Config
 from fmpjax.errors import UserError
 
 
@@ -16,14 +16,23 @@ def parts(config: Config, seeds: int = 1) -> dict[str, int]:
     Only large arrays that exist at the same time are counted. The compiled programs that were measured (in
     ``tests/test_memory.py``) take 1.2 to 2.7 times the sum.
     """
-    prior, amp = config.prior, config.amp
+    prior = config.prior
     window = 4 * config.features.history * len(features.compact_weights(robots.load(config.robot)))  # float32
     # A rollout's windows, and once more on their way through the prior.
     needed = {"env.count": 2 * config.transitions_per_iteration * window}
-    if config.method == "amp":
-        needed["amp.replay"] = amp.replay * window // 2  # float16
-        needed["amp.minibatch"] = 4 * amp.minibatch * window  # three kinds of windows, and slopes
-    else:
+    section = getattr(config, config.method, None)
+    if isinstance(section, AdversaryConfig):
+        kinds = 3 if section.replay else 2
+        needed[f"{config.method}.replay"] = section.replay * window // 2  # float16
+        needed[f"{config.method}.minibatch"] = (kinds + 1) * section.minibatch * window  # kinds of windows, and slopes
+    elif config.method == "smp":
+        layers, heads, head_width = SMP_NETWORKS[config.smp.network]
+        layer = 4 * config.features.history * heads * head_width  # float32
+        # The gated layer's two halves, four times as wide; scoring keeps no layer, pretraining all, with attention.
+        needed["smp.score_batch"] = min(config.smp.score_batch, config.transitions_per_iteration) * 8 * layer
+        needed["smp.batch"] = config.smp.batch * 12 * layers * layer
+        del needed[min(("smp.score_batch", "smp.batch"), key=needed.get)]  # one after the other
+    elif section is None:  # a transport
         needed["prior.bank"] = 2 * 4 * prior.bank**2  # costs to another bank and to itself
     if config.method in ("fmp", "endpoint", "value"):
         # Queries, targets, points and their slopes; costs to both banks.

@@ -45,13 +45,19 @@ class Batch(NamedTuple):
     reward: jax.Array
     fell: jax.Array
     timed_out: jax.Array
+    age: jax.Array | None = None  # [T, N] int, steps of the episode up to and including this one
 
 
 class PPO:
-    """Pure functions of the networks that a configuration describes."""
+    """Pure functions of the networks that a configuration describes.
 
-    def __init__(self, observation_size: int, action_size: int, config: PPOConfig):
-        self.config = config
+    Args:
+      clock: steps of the longest episode, where the critic also observes the share of them that is over. A reward that
+        depends on an episode's past needs it. 0 for a critic that observes what the policy does.
+    """
+
+    def __init__(self, observation_size: int, action_size: int, config: PPOConfig, clock: int = 0):
+        self.config, self.clock = config, clock
         self.observation_size, self.action_size = observation_size, action_size
         activation = elu if config.activation == "elu" else getattr(linen, config.activation)
         initializers = jax.nn.initializers
@@ -75,9 +81,14 @@ class PPO:
             init_noise_std=config.deviation,
             mean_kernel_init=lambda key, shape, dtype=jnp.float32: jax.random.uniform(key, shape, dtype, -bound, bound),
         )
+
+        def normalize_timed(observation, statistics):
+            observed, over = observation[..., :observation_size], observation[..., observation_size:]
+            return jnp.concatenate([normalize(observed, statistics), over], axis=-1)
+
         self._value = networks.make_value_network(
-            observation_size,
-            preprocess_observations_fn=normalize,
+            observation_size + bool(clock),
+            preprocess_observations_fn=normalize_timed if clock else normalize,
             hidden_layer_sizes=config.hidden,
             activation=activation,
             kernel_init=kernel,
@@ -129,15 +140,19 @@ class PPO:
 
         return Policy(act, draw)
 
-    def value(self, state: PPOState, observation: jax.Array) -> jax.Array:
-        """Value estimates ``[...]``."""
-        return self._value.apply(state.normalizer, state.critic, observation)
+    def value(self, state: PPOState, observation: jax.Array, age: jax.Array | None = None) -> jax.Array:
+        """Value estimates ``[...]`` after ``age [...]`` steps of an episode, which only a critic with a clock reads."""
+        return self._value.apply(state.normalizer, state.critic, self._critic_input(observation, age))
+
+    def _critic_input(self, observation, age):
+        return jnp.concatenate([observation, age[..., None] / self.clock], axis=-1) if self.clock else observation
 
     def update(self, state: PPOState, batch: Batch, key: jax.Array) -> tuple[PPOState, dict[str, jax.Array]]:
         """One PPO update from a rollout."""
         config = self.config
-        value = self.value(state, batch.observation)
-        next_value = self.value(state, batch.next_observation)
+        before = None if batch.age is None else batch.age - 1
+        value = self.value(state, batch.observation, before)
+        next_value = self.value(state, batch.next_observation, batch.age)
         advantage = generalized_advantage(
             batch.reward,
             value,
@@ -157,7 +172,8 @@ class PPO:
 
         def critic_loss(params, sample):
             samples, target, _ = sample
-            error = self._value.apply(state.normalizer, params, samples.observation) - target
+            seen = self._critic_input(samples.observation, None if samples.age is None else samples.age - 1)
+            error = self._value.apply(state.normalizer, params, seen) - target
             # Adam with a clipped norm needs a loss of order one; plain SGD takes MimicKit's loss as it is.
             scale = 0.5 / (1.0 + return_variance) if config.optimizer == "adam" else 1.0
             return scale * jnp.mean(error**2), {}

@@ -44,7 +44,8 @@ class Trainer:
         for clip in self.library.clips:
             _check(clip, self.robot, config)
         self.env = Env(self.robot, self.library, config, physics.make(self.robot, config.physics))
-        self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo)
+        clock = config.env.longest_episode if priors.remembers(config.method) else 0
+        self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo, clock)
         windows, share = self.env.clip_windows(), self.env.window_share()
         self.feature_map = features.fit_feature_map(self.robot, windows, config.features, share)
         self.expert = priors.Expert(
@@ -105,7 +106,7 @@ class Trainer:
         # Devices split the windows as the prior does, by rows of the rollout: indices travel, windows do not.
         windows = self.prior_map(self.env.frame_table(state.env, steps)[sharding.gather(steps.window)])
         prior, reward, prior_metrics = self.prior.update(
-            state.prior, priors.Rollout(windows, ~steps.nonfinite), prior_key
+            state.prior, priors.Rollout(windows, ~steps.nonfinite, steps.length == 1), prior_key
         )
         ppo, ppo_metrics = self.ppo.update(state.ppo, _batch(steps, reward), ppo_key)
         skipped = prior_metrics.get("skipped", 0.0) + ppo_metrics["skipped"]
@@ -196,6 +197,7 @@ def _batch(steps: Steps, reward: jax.Array) -> Batch:
         reward=reward,
         fell=steps.fell,
         timed_out=steps.timed_out,
+        age=steps.length,
     )
 
 

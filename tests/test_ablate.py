@@ -30,12 +30,12 @@ def specification(path, text):
 # --- plans -----------------------------------------------------------------------------------------------------------
 
 
-def test_plan_is_every_method_reset_and_seed():
+def test_plan_is_every_method_of_the_paper_reset_and_seed():
     planned = cells.plan(cells.Specification(preset="smoke", seeds=(0, 7)))
     assert len(planned) == 6 * 2 * 2
     assert len({cell.name for cell in planned}) == len(planned)
     assert {(c.config.method, c.config.env.reset, c.config.seed) for c in planned} == {
-        (m, r, s) for m in priors.METHODS for r in ("dataset", "fixed") for s in (0, 7)
+        (m, r, s) for m in priors.PAPER for r in ("dataset", "fixed") for s in (0, 7)
     }
     # Nothing else differs between two cells.
     a, b = (configuration.flatten(c.config) for c in planned[:2])
@@ -77,7 +77,7 @@ def test_bad_specification(tmp_path, text, message):
 def test_missing_specification_and_unknown_names(tmp_path):
     with pytest.raises(UserError, match="cannot read .*none.toml: No such file"):
         cells.read_specification(tmp_path / "none.toml")
-    with pytest.raises(UserError, match="unknown method 'gail'"):
+    with pytest.raises(UserError, match="unknown method 'gan'"):
         cells.plan(cells.Specification(methods=("gail",)))
     with pytest.raises(UserError, match="unknown reset 'random'"):
         cells.plan(cells.Specification(resets=("random",)))
@@ -91,9 +91,9 @@ def test_missing_specification_and_unknown_names(tmp_path):
 
 def test_errors_exit_with_code_two(tmp_path, capsys):
     with pytest.raises(SystemExit) as exit_info:
-        ablate.cli(["--out", str(tmp_path), "--methods", "gail"])
+        ablate.cli(["--out", str(tmp_path), "--methods", "gan"])
     assert exit_info.value.code == 2
-    assert capsys.readouterr().err == f"fmpjax: unknown method 'gail': expected one of {', '.join(priors.METHODS)}\n"
+    assert capsys.readouterr().err == f"fmpjax: unknown method 'gan': expected one of {', '.join(priors.METHODS)}\n"
     file, folder = tmp_path / "file", tmp_path / "out"
     file.write_text("")
     (folder / "fmp-dataset" / "seed0").mkdir(parents=True)

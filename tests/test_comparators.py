@@ -1,4 +1,4 @@
-"""The comparators: nested ablations of FMP, the averaged transport score, the barycentric target and AMP."""
+"""What every prior keeps to; nested ablations of FMP, the averaged transport score, the barycentric target and AMP."""
 
 import dataclasses
 import math
@@ -9,13 +9,19 @@ import numpy as np
 import pytest
 
 from fmpjax import priors, transport
-from fmpjax.config import AMPConfig, Config, PriorConfig
-from fmpjax.priors import Expert, Rollout, amp, barycentric, empirical
+from fmpjax.checkpoint import Checkpoints
+from fmpjax.config import AMPConfig, Config, EnvConfig, GAILConfig, PriorConfig, SMPConfig, WAILConfig
+from fmpjax.priors import Expert, Rollout, adversary, amp, barycentric, empirical
+from fmpjax.train import TrainState
 
 STEPS, COUNT = 8, 32  # of a rollout
 SMALL = Config(
     prior=PriorConfig(bank=32, minibatch=32, updates=1, hidden=(16,), score_banks=3),
     amp=AMPConfig(hidden=(16,), updates=4, minibatch=32, replay=400, replay_new=10, optimizer="adam"),
+    gail=GAILConfig(hidden=(16,), updates=4, minibatch=32),
+    wail=WAILConfig(hidden=(16,), updates=2, minibatch=32),
+    smp=SMPConfig(network="small", iterations=5, batch=8),
+    env=EnvConfig(count=COUNT),
 )
 
 
@@ -29,7 +35,7 @@ def expert_of(windows, horizon=1):
 def rollout_of(points, valid=None):
     points = jnp.asarray(points, jnp.float32)
     valid = jnp.ones((STEPS, COUNT), bool) if valid is None else jnp.asarray(valid)
-    return Rollout(points.reshape(STEPS, COUNT, -1), valid)
+    return Rollout(points.reshape(STEPS, COUNT, -1), valid, jnp.zeros((STEPS, COUNT), bool))
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +46,8 @@ def cloud():
 
 
 @pytest.mark.parametrize("method", priors.METHODS)
-def test_every_prior_keeps_the_contract(cloud, method):
-    """Shapes, finite rewards, 0 where a window is not valid, a function of its key alone, state that stays a state."""
+def test_every_prior_keeps_the_contract(cloud, method, tmp_path):
+    """Shapes, finite rewards, 0 where a window is not valid, a function of its key alone, a state that can be saved."""
     expert, points = cloud
     if method == "barycentric":
         expert = expert_of(jnp.tile(expert.windows, (1, 2)), horizon=2)
@@ -52,7 +58,7 @@ def test_every_prior_keeps_the_contract(cloud, method):
     points = points.reshape(STEPS, COUNT, -1).copy()
     points[2, 5] = np.nan
     update = jax.jit(prior.update)
-    state = prior.init(jax.random.PRNGKey(0))
+    state = jax.jit(prior.init)(jax.random.PRNGKey(0))
     new, reward, metrics = update(state, rollout_of(points, valid), jax.random.PRNGKey(1))
     assert reward.shape == (STEPS, COUNT)
     assert np.isfinite(reward).all()
@@ -65,8 +71,11 @@ def test_every_prior_keeps_the_contract(cloud, method):
     assert jax.tree.all(jax.tree.map(same, new, state))
     again = update(state, rollout_of(points, valid), jax.random.PRNGKey(1))
     np.testing.assert_array_equal(again[1], reward)
-    scores = prior.score(new, rollout_of(np.nan_to_num(points)).features.reshape(STEPS * COUNT, -1))
+    scores = jax.jit(prior.score)(new, rollout_of(np.nan_to_num(points)).features.reshape(STEPS * COUNT, -1))
     assert scores.shape == (STEPS * COUNT,)
+    run = TrainState(None, new, None, jax.random.PRNGKey(2), jnp.int32(1), jnp.int32(0))
+    Checkpoints(tmp_path).save(run)
+    jax.tree.map(np.testing.assert_array_equal, Checkpoints(tmp_path).restore(run), run)
 
 
 # --- nested ablations ------------------------------------------------------------------------------------------------
@@ -215,8 +224,8 @@ def test_amp_loss_by_hand():
     penalty 0.01 * 4 = 0.04. Sum 41.760095.
     """
     params = {"params": {"logit": {"kernel": jnp.array([[2.0]]), "bias": jnp.zeros(1)}}}
-    network = amp.Discriminator((), 1.0, 1.0)
-    total, stats = amp.loss(network.apply, params, jnp.array([[0.5]]), jnp.array([[-1.0]]), AMPConfig())
+    network = adversary.Network((), 1.0, 1.0)
+    total, stats = adversary.cross_entropy(network.apply, params, jnp.array([[0.5]]), jnp.array([[-1.0]]), AMPConfig())
     assert float(total) == pytest.approx(41.760095, rel=1e-6)
     assert float(stats["discriminator_loss"]) == pytest.approx(1.720095, rel=1e-6)
     assert float(stats["gradient_penalty"]) == pytest.approx(4.0)
@@ -226,24 +235,24 @@ def test_amp_loss_by_hand():
 def test_amp_normaliser_weighs_agent_and_demonstration_alike():
     """Against numpy on all that was seen, where the two sides had equally many windows."""
     rng = np.random.default_rng(0)
-    state = amp.Normalizer(jnp.float32(0.0), jnp.zeros(2), jnp.ones(2))
+    state = adversary.Normalizer(jnp.float32(0.0), jnp.zeros(2), jnp.ones(2))
     batches = [(rng.normal(1, 2, (50, 2)), rng.normal(-3, 0.5, (50, 2))) for _ in range(3)]
     for agent, demonstration in batches:
-        state = amp.update_normalizer(state, jnp.asarray(agent), jnp.asarray(demonstration))
+        state = adversary.update_normalizer(state, jnp.asarray(agent), jnp.asarray(demonstration))
     seen = np.concatenate([np.concatenate(batch) for batch in batches])
     np.testing.assert_allclose(state.mean, seen.mean(0), rtol=1e-5)
     np.testing.assert_allclose(state.variance, seen.var(0), rtol=1e-5)
     # Four times as many of the agent's change nothing.
     agent, demonstration = batches[0]
-    begin = amp.Normalizer(jnp.float32(0.0), jnp.zeros(2), jnp.ones(2))
-    more = amp.update_normalizer(begin, jnp.asarray(np.tile(agent, (4, 1))), jnp.asarray(demonstration))
+    begin = adversary.Normalizer(jnp.float32(0.0), jnp.zeros(2), jnp.ones(2))
+    more = adversary.update_normalizer(begin, jnp.asarray(np.tile(agent, (4, 1))), jnp.asarray(demonstration))
     np.testing.assert_allclose(more.mean, np.concatenate([agent, demonstration]).mean(0), rtol=1e-5)
 
 
 def test_amp_replay_fills_and_then_turns_over_slowly():
     """400 places: three rollouts of 150 go in whole, the last 50 over the oldest, then 10 a rollout, oldest first."""
-    replay = amp.Replay(jnp.zeros((400, 1), jnp.float16), jnp.int32(0), jnp.int32(0))
-    put = jax.jit(amp.store, static_argnums=2)
+    replay = adversary.Replay(jnp.zeros((400, 1), jnp.float16), jnp.int32(0), jnp.int32(0))
+    put = jax.jit(adversary.store, static_argnums=2)
 
     def held():
         return [int((np.asarray(replay.windows)[: int(replay.count)] == value).sum()) for value in range(1, 6)]

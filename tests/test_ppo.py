@@ -229,6 +229,22 @@ def test_value_of_a_reward_one_step_away():
     np.testing.assert_allclose(ppo.value(state, jnp.array([[0.0], [1.0]])), [0.5, 1.0], atol=0.02)
 
 
+def test_value_of_a_reward_that_only_the_clock_tells():
+    """Eight steps that look alike, reward 1 at the last, then a fall: the critic must know how many are over."""
+    ppo = PPO(1, 1, PROBE, clock=STEPS)
+    last = jnp.broadcast_to((jnp.arange(STEPS) == STEPS - 1)[:, None], (STEPS, COUNT))
+    age = jnp.broadcast_to(1 + jnp.arange(STEPS)[:, None], (STEPS, COUNT))
+    env = probe(1.0, last, following=1.0, reward=1.0 * last)
+
+    def one(state, key):
+        return ppo.update(state, batch_of(ppo, state, key, env)._replace(age=age), key)[0], None
+
+    keys = jax.random.split(jax.random.PRNGKey(1), 150)
+    state, _ = jax.jit(lambda state: jax.lax.scan(one, state, keys))(ppo.init(jax.random.PRNGKey(0)))
+    over = jnp.arange(STEPS)
+    np.testing.assert_allclose(ppo.value(state, jnp.ones((STEPS, 1)), over), 0.5 ** (7 - over), atol=0.1)
+
+
 def test_policy_finds_the_rewarded_action():
     ppo, state, _ = train(probe(1.0, YES, cost=1.0, wanted=0.5))
     mean, _ = ppo.policy(state.actor, state.normalizer, jnp.ones((1, 1)))

@@ -400,5 +400,5 @@ def test_invalid_and_nan_scores_get_nothing_and_move_nothing():
 
 
 def test_unknown_method():
-    with pytest.raises(UserError, match="unknown method 'gail': expected one of"):
-        make("gail", np.zeros((2, 2)), PriorConfig())
+    with pytest.raises(UserError, match="unknown method 'gan': expected one of"):
+        make("gan", np.zeros((2, 2)), PriorConfig())

@@ -69,13 +69,15 @@ def test_seeds_split_over_devices_are_those_of_one():
     assert_close(program(t.init(2))[0], unstack(after)[2])
 
 
-@pytest.mark.parametrize("method", ["fmp", "amp", "bank16", "barycentric"])
+@pytest.mark.parametrize("method", ["fmp", "amp", "wail", "pwil", "smp", "bank16", "barycentric"])
 def test_a_prior_splits_its_windows(method):
-    config = tiny(**{"amp.minibatch": 16, "amp.replay": 64, "amp.replay_new": 8})
+    changes = {"amp.minibatch": 16, "amp.replay": 64, "amp.replay_new": 8, "wail.minibatch": 16, "smp.batch": 8}
+    config = tiny(**changes)
     key = jax.random.PRNGKey(0)
     expert = priors.Expert(jax.random.normal(key, (40, 20)), 20.0, jnp.full(20, 20**-0.5), 10)
     prior = priors.make(method, expert, config)
     rollout = priors.Rollout(jax.random.normal(jax.random.PRNGKey(1), (4, 8, 20)) + 0.5, jnp.ones((4, 8), bool))
+    rollout = rollout._replace(start=jnp.arange(32).reshape(4, 8) % 5 == 0)
     one = jax.jit(prior.update)(prior.init(key), rollout, key)
     over = sharding.mesh(DEVICES)
     split = jax.device_put(rollout, jax.NamedSharding(over, jax.P(None, sharding.AXIS)))

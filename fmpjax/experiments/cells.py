@@ -30,13 +30,13 @@ _POLL = 1.0  # s between looks at the running cells
 
 @dataclasses.dataclass(frozen=True)
 class Specification:
-    """A plan: every method with every reset, variant and seed."""
+    """A plan: every method, by default of the paper, with every reset, variant and seed."""
 
     preset: str = "laptop"
     motion: str = "walk"
     frames: str = ""
     transitions: int = 0  # 0 for the preset's
-    methods: tuple[str, ...] = priors.METHODS
+    methods: tuple[str, ...] = priors.PAPER
     resets: tuple[str, ...] = ("dataset", "fixed")
     seeds: tuple[int, ...] = (0,)
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # section.field: value, of every cell

@@ -25,6 +25,10 @@ TITLES = {
     "bank16": "16-bank score",
     "amp": "AMP",
     "barycentric": "Barycentric OT",
+    "gail": "GAIL",
+    "wail": "WAIL",
+    "pwil": "PWIL",
+    "smp": "SMP",
 }
 
 

@@ -2,7 +2,7 @@
 
 from fmpjax.config import Config
 from fmpjax.errors import UserError
-from fmpjax.priors import amp, barycentric, empirical, flow
+from fmpjax.priors import amp, barycentric, empirical, flow, gail, pwil, smp, wail
 from fmpjax.priors.base import Expert, MotionPrior, Reward, Rollout, couple, median_reward
 
 _REGISTRY = {
@@ -12,9 +12,15 @@ _REGISTRY = {
     "bank16": empirical.make,
     "barycentric": barycentric.make,
     "amp": amp.make,
+    "gail": gail.make,
+    "wail": wail.make,
+    "pwil": pwil.make,
+    "smp": smp.make,
 }
 METHODS = tuple(_REGISTRY)
-_OWN_NORMALIZER = ("amp",)
+PAPER = ("fmp", "endpoint", "value", "bank16", "barycentric", "amp")  # those of the paper's Table I
+_OWN_NORMALIZER = ("amp", "gail", "wail")
+_REMEMBERS = ("pwil",)
 _POTENTIALS = ("fmp", "endpoint", "value")
 
 
@@ -38,6 +44,11 @@ def normalizes(method: str) -> bool:
     return method in _OWN_NORMALIZER
 
 
+def remembers(method: str) -> bool:
+    """Whether the reward of a window depends on what its episode did before, so that the critic needs a clock."""
+    return method in _REMEMBERS
+
+
 def check_potential(method: str) -> None:
     """Raise a `UserError` unless ``method`` fits a potential to transport."""
     if method not in _POTENTIALS:
@@ -52,6 +63,7 @@ def check(method: str) -> None:
 
 __all__ = [
     "METHODS",
+    "PAPER",
     "Expert",
     "MotionPrior",
     "Reward",
@@ -63,4 +75,5 @@ __all__ = [
     "make",
     "median_reward",
     "normalizes",
+    "remembers",
 ]

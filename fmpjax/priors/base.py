@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from fmpjax import sharding, transport
 from fmpjax.config import PriorConfig
@@ -18,6 +19,7 @@ class Rollout(NamedTuple):
 
     features: jax.Array  # [T, N, D] features of the windows that end with the post-step, pre-reset states
     valid: jax.Array  # [T, N] bool, false where the state was not finite
+    start: jax.Array | None = None  # [T, N] bool, true at an episode's first step; None where nothing asks for it
 
 
 class Expert(NamedTuple):
@@ -63,6 +65,14 @@ def flatten(rollout: Rollout, stand_in: jax.Array) -> jax.Array:
     """All windows of a rollout, ``[T * N, D]``; ``stand_in [D]`` takes the place of those that are not finite."""
     features = jnp.where(rollout.valid[..., None], rollout.features, stand_in)
     return sharding.split(features.reshape(-1, features.shape[-1]))
+
+
+def step_if_finite(optimizer: optax.GradientTransformation, params, state: optax.OptState, loss, gradients):
+    """Parameters and optimizer state after a step, and whether it was taken: not where a number is not finite."""
+    updates, new_state = optimizer.update(gradients, state, params)
+    finite = jnp.isfinite(loss) & jnp.isfinite(optax.global_norm(gradients))
+    new = (optax.apply_updates(params, updates), new_state)
+    return *jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, (params, state)), finite
 
 
 class Coupling(NamedTuple):

@@ -1,0 +1,232 @@
+"""What the adversarial priors share: network, normalizer, replay and updates.
+
+A network tells the rollout's windows, present and replayed, from the demonstration's. The rollout is scored with the
+network that the previous rollouts left, and only then is the network trained.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen
+
+from fmpjax import sharding
+from fmpjax.config import AdversaryConfig
+from fmpjax.priors.base import Expert, Metrics, MotionPrior, Rollout, flatten, step_if_finite
+
+
+class Normalizer(NamedTuple):
+    """Running mean and variance of all windows seen, agent's and demonstration's half and half."""
+
+    count: jax.Array  # scalar
+    mean: jax.Array  # [D]
+    variance: jax.Array  # [D]
+
+
+class Replay(NamedTuple):
+    """Windows of earlier rollouts in half precision: relative error 5e-4, half the memory."""
+
+    windows: jax.Array  # [R, D] float16
+    head: jax.Array  # scalar int32, where the next window goes
+    count: jax.Array  # scalar int32, windows held
+
+
+class State(NamedTuple):
+    """State of the adversary between rollouts."""
+
+    params: Any
+    optimizer: optax.OptState
+    normalizer: Normalizer
+    replay: Replay | None  # None where the settings ask for no replay: a checkpoint holds no empty array
+
+
+class Network(linen.Module):
+    """One number ``[n]`` per normalized window ``[n, D]``; larger means more like the demonstration.
+
+    Weights start uniform within 1 / sqrt(inputs), of the first layer those of the full window.
+    """
+
+    hidden: tuple[int, ...]
+    logit_init: float
+    dimension: float  # d, coordinates of the full window
+
+    @linen.compact
+    def __call__(self, x):
+        inputs = self.dimension
+        for width in self.hidden:
+            x = linen.relu(linen.Dense(width, kernel_init=_uniform(1 / math.sqrt(inputs)))(x))
+            inputs = width
+        return linen.Dense(1, kernel_init=_uniform(self.logit_init), name="logit")(x)[..., 0]
+
+
+def _uniform(bound: float):
+    return lambda key, shape, dtype=jnp.float32: jax.random.uniform(key, shape, dtype, -bound, bound)
+
+
+def update_normalizer(state: Normalizer, agent: jax.Array, demonstration: jax.Array) -> Normalizer:
+    """The normalizer after windows ``[n, D]`` of each kind; the two count alike whatever their numbers."""
+    mean = 0.5 * (agent.mean(0) + demonstration.mean(0))
+    square = 0.5 * (((agent - mean) ** 2).mean(0) + ((demonstration - mean) ** 2).mean(0))
+    fresh = jnp.float32(len(agent) + len(demonstration))
+    total = state.count + fresh
+    share = fresh / total
+    shift = mean - state.mean
+    # Chan's formula for the variance of two groups together.
+    variance = (1 - share) * state.variance + share * square + share * (1 - share) * shift**2
+    return Normalizer(total, state.mean + share * shift, variance)
+
+
+def store(replay: Replay, windows: jax.Array, new: int, key: jax.Array) -> Replay:
+    """Replay with windows ``[n, D]`` put in: all until it is full, then ``new`` random ones; the oldest make room."""
+    size = len(replay.windows)
+    shuffled = jax.random.permutation(key, windows).astype(replay.windows.dtype)[:size]
+    order = jnp.arange(len(shuffled))
+    filling = replay.count < size
+    # Rows sent to `size` are dropped.
+    rows = jnp.where(filling | (order < new), (replay.head + order) % size, size)
+    stored = jnp.where(filling, len(shuffled), min(new, len(shuffled)))
+    return Replay(
+        replay.windows.at[rows].set(shuffled, mode="drop"),
+        ((replay.head + stored) % size).astype(jnp.int32),
+        jnp.minimum(replay.count + stored, size).astype(jnp.int32),
+    )
+
+
+def cross_entropy(apply, params, agent: jax.Array, demonstration: jax.Array, config: AdversaryConfig):
+    """Cross entropy, gradient penalty on both sides and logit penalty at normalized windows; and statistics."""
+
+    def logits_and_slopes(x):
+        logit, pull_back = jax.vjp(lambda y: apply(params, y), x)
+        return logit, jnp.mean(jnp.sum(pull_back(jnp.ones_like(logit))[0] ** 2, axis=-1))
+
+    agent_logit, agent_slope = logits_and_slopes(agent)
+    expert_logit, expert_slope = logits_and_slopes(demonstration)
+    # -log(1 - sigmoid(l)) = softplus(l) and -log sigmoid(l) = softplus(-l).
+    entropy = 0.5 * (jax.nn.softplus(agent_logit).mean() + jax.nn.softplus(-expert_logit).mean())
+    slope = 0.5 * (agent_slope + expert_slope)
+    kernel = params["params"]["logit"]["kernel"]
+    total = entropy
+    if config.gradient_penalty:
+        total += config.gradient_penalty * slope
+    total += config.logit_penalty * jnp.sum(kernel**2)
+    stats = {
+        "discriminator_loss": entropy,
+        "gradient_penalty": slope,
+        "agent_accuracy": jnp.mean(agent_logit < 0, dtype=jnp.float32),
+        "expert_accuracy": jnp.mean(expert_logit > 0, dtype=jnp.float32),
+    }
+    return total, stats
+
+
+# apply, params, agent [n, D], demonstration [m, D], key -> loss, statistics
+Loss = Callable[..., tuple[jax.Array, dict[str, jax.Array]]]
+
+
+class Adversary(NamedTuple):
+    """A network and its training."""
+
+    init: Callable[[jax.Array], State]
+    score: Callable[[State, jax.Array], jax.Array]  # the network's number [n] of windows [n, D]
+    # State, windows [n, D] of a rollout, their scores [n], key -> state, metrics
+    fit: Callable[[State, jax.Array, jax.Array, jax.Array], tuple[State, Metrics]]
+
+
+def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
+    """The network that minimizes ``loss`` between the windows of the demonstration and the policy's."""
+    network = Network(settings.hidden, settings.logit_init, expert.dimension)
+    size = expert.windows.shape[-1]
+    if settings.optimizer == "adam":
+        direction = optax.scale_by_adam()
+    else:
+        direction = optax.trace(settings.momentum)
+    optimizer = optax.chain(
+        optax.add_decayed_weights(settings.weight_decay), direction, optax.scale(-settings.learning_rate)
+    )
+    # A feature over its weight is a standardized coordinate. Coordinates that stand twice in the full window stand once
+    # here, root two times as large, so that the gradient penalty is the full window's.
+    multiplicity = jnp.sqrt(expert.dimension) * expert.weight
+
+    def normalize(normalizer: Normalizer, x):
+        deviation = jnp.sqrt(jnp.maximum(normalizer.variance, settings.normalizer_floor**2))
+        z = (x / expert.weight - normalizer.mean) / deviation
+        return jnp.clip(z, -settings.normalizer_clip, settings.normalizer_clip) * multiplicity
+
+    def init(key):
+        params = network.init(key, jnp.zeros((1, size)))
+        normalizer = Normalizer(jnp.float32(0.0), jnp.zeros(size), jnp.ones(size))
+        replay = None
+        if settings.replay:
+            replay = Replay(jnp.zeros((settings.replay, size), jnp.float16), jnp.int32(0), jnp.int32(0))
+        return State(params, optimizer.init(params), normalizer, replay)
+
+    def score(state: State, x):
+        return network.apply(state.params, normalize(state.normalizer, x))
+
+    def fit(state: State, pool, scores, key):
+        order_key, seen_key, replay_key, store_key = jax.random.split(key, 4)
+        replay = store(state.replay, pool, settings.replay_new, store_key) if settings.replay else None
+
+        def step(carry, inputs):
+            params, optimizer_state = carry
+            rows, key = inputs
+            agent_key, expert_key = jax.random.split(key)
+            agent = sharding.split(pool[rows])
+            if settings.replay:
+                old = replay.windows[jax.random.randint(agent_key, rows.shape, 0, replay.count)].astype(pool.dtype)
+                agent = jnp.concatenate([agent, old])
+            agent = normalize(state.normalizer, agent)
+            demonstration = normalize(state.normalizer, expert.draw(expert_key, rows.shape))
+            (total, stats), gradients = jax.value_and_grad(
+                lambda p: loss(network.apply, p, agent, demonstration, jax.random.fold_in(key, 1)), has_aux=True
+            )(params)
+            params, optimizer_state, finite = step_if_finite(optimizer, params, optimizer_state, total, gradients)
+            return (params, optimizer_state), stats | {"skipped": (~finite).astype(jnp.float32)}
+
+        # Passes over the rollout in random order, as many as the updates need.
+        needed = settings.updates * settings.minibatch
+        passes = -(-needed // len(pool))
+        order = jax.vmap(lambda k: jax.random.permutation(k, len(pool)))(jax.random.split(order_key, passes))
+        rows = order.reshape(-1)[:needed].reshape(settings.updates, settings.minibatch)
+        (params, optimizer_state), stats = jax.lax.scan(
+            step, (state.params, state.optimizer), (rows, jax.random.split(replay_key, settings.updates))
+        )
+        # What scored and was fitted saw one normalizer; the next rollout is scored with the next.
+        seen = expert.draw(seen_key, (len(pool),))
+        normalizer = update_normalizer(state.normalizer, pool / expert.weight, seen / expert.weight)
+        low, middle, high = jnp.quantile(scores, jnp.array([0.25, 0.5, 0.75]))
+        summary = {name: values.mean() for name, values in stats.items()}
+        summary |= {
+            "skipped": stats["skipped"].sum(),
+            "score_median": middle,
+            "score_spread": high - low,
+            "expert_margin": (score(state, expert.windows).mean() - middle) / jnp.maximum(high - low, 1e-6),
+        }
+        if settings.replay:
+            summary["replayed"] = replay.count.astype(jnp.float32)
+        return State(params, optimizer_state, normalizer, replay), summary
+
+    return Adversary(init, score, fit)
+
+
+def discriminator(
+    expert: Expert, settings: AdversaryConfig, reward_of: Callable[[jax.Array], jax.Array]
+) -> MotionPrior:
+    """A prior whose adversary minimizes `cross_entropy` and whose reward is a function of the logit alone."""
+    adversary = make(
+        expert,
+        settings,
+        lambda apply, params, agent, demonstration, _: cross_entropy(apply, params, agent, demonstration, settings),
+    )
+
+    def update(state: State, rollout: Rollout, key):
+        pool = flatten(rollout, expert.windows[0])
+        logits = adversary.score(state, pool)
+        reward = reward_of(logits).reshape(rollout.valid.shape)
+        reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
+        state, summary = adversary.fit(state, pool, logits, key)
+        return state, reward, summary
+
+    return MotionPrior(adversary.init, update, adversary.score)
