@@ -172,6 +172,7 @@ class SMPConfig:
     average: float = 0.995  # factor of the parameter average; the average scores [S, there once in ten iterations]
     score_steps: tuple[int, ...] = (22, 15, 8)  # noise steps at which windows are scored [S]
     score_batch: int = 4096  # windows scored side by side, which bounds the memory that this takes [S]
+    scale: float = 1.0  # the reward of a window without error [S]
     decay: float = 6.0  # of the reward with the error relative to its running mean [S]
     error_floor: float = 1e-4  # least running mean of the error [S]
     mean_samples: float = 5e7  # windows after which that running mean stays [S, its G1 variant]
@@ -286,7 +287,8 @@ class Config:
 # - AMP with Adam, a smaller network and replay, and as many updates and samples in each as the potential has; GAIL and
 #   WAIL with the same network and samples; GAIL with as many updates and AMP's rate, since 1e-5 hardly moves in so few;
 # - SMP with a smaller network, fewer and smaller iterations and the larger rate that these allow: pretraining takes
-#   seconds to minutes instead of hours on two cores. It is not the published prior, and `smp.network` says so.
+#   seconds to minutes instead of hours on two cores. It is not the published prior, and `smp.network` says so. Its
+#   reward is scaled by e^6 or so: an average window earns 1, which the critic finds, and not 0.0025.
 _LAPTOP: dict[str, Any] = {
     "robot": "unitree_g1",
     "precision": "default",
@@ -328,6 +330,7 @@ _LAPTOP: dict[str, Any] = {
     "smp.iterations": 2000,
     "smp.batch": 128,
     "smp.learning_rate": 1e-3,
+    "smp.scale": 400.0,
     "ppo.hidden": (256, 128),
     "ppo.activation": "elu",
     "ppo.orthogonal": True,
@@ -501,7 +504,7 @@ _POSITIVE = (
     "prior.spread_floor prior.value_scale env.last_cap prior.score_banks prior.temperature amp.updates "
     "amp.minibatch amp.replay amp.replay_new amp.learning_rate gail.updates gail.minibatch gail.replay_new "
     "gail.learning_rate wail.updates wail.minibatch wail.replay_new wail.learning_rate wail.deviation_half_life "
-    "wail.deviation_floor pwil.scale pwil.decay smp.noise_steps smp.iterations smp.batch smp.learning_rate "
+    "wail.deviation_floor pwil.scale pwil.decay smp.noise_steps smp.iterations smp.batch smp.scale smp.learning_rate "
     "smp.clip_norm smp.decay smp.error_floor smp.mean_samples smp.score_batch"
 ).split()
 
@@ -538,6 +541,12 @@ def validate(config: Config) -> Config:
         raise UserError(
             f"setting smp.score_steps is {', '.join(map(str, steps)) or 'empty'}: expected noise steps from 0 to "
             f"{config.smp.noise_steps - 1}, below smp.noise_steps"
+        )
+    longest = config.env.longest_episode
+    if config.method == "pwil" and config.pwil.slack * longest >= 1:
+        raise UserError(
+            f"setting pwil.slack is {config.pwil.slack:g}: expected less than {1 / longest:g}, the mass of one of the "
+            f"{longest} steps that an episode has"
         )
     if not 0 <= config.seed < 2**32:
         raise UserError(f"setting seed is {config.seed}: expected 0 to {2**32 - 1}")

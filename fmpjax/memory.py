@@ -28,9 +28,10 @@ def parts(config: Config, seeds: int = 1) -> dict[str, int]:
     elif config.method == "smp":
         layers, heads, head_width = SMP_NETWORKS[config.smp.network]
         layer = 4 * config.features.history * heads * head_width  # float32
-        # The gated layer's two halves, four times as wide; scoring keeps no layer, pretraining all, with attention.
+        needed["env.count"] *= 2  # the windows beside the demonstration's, and their noise
+        # The gated layer's two halves, four times as wide. Scoring keeps no layer; pretraining keeps all, and slopes.
         needed["smp.score_batch"] = min(config.smp.score_batch, config.transitions_per_iteration) * 8 * layer
-        needed["smp.batch"] = config.smp.batch * 12 * layers * layer
+        needed["smp.batch"] = config.smp.batch * 36 * layers * layer
         del needed[min(("smp.score_batch", "smp.batch"), key=needed.get)]  # one after the other
     elif section is None:  # a transport
         needed["prior.bank"] = 2 * 4 * prior.bank**2  # costs to another bank and to itself

@@ -27,6 +27,11 @@ MEASURED = {
     ("smoke", "method=barycentric", "env.count=512", "prior.bank=1024"): 187.8,
     ("smoke", "method=bank16", "env.count=512", "prior.bank=1024"): 318.6,
     ("smoke", "method=amp", "env.count=512"): 408.9,
+    ("smoke", "method=gail", "env.count=512"): 333.2,
+    ("smoke", "method=pwil", "env.count=512"): 184.1,
+    ("smoke", "method=smp", "env.count=512"): 731.8,
+    ("smoke", "method=smp", "smp.batch=8192"): 1295.9,
+    ("laptop", "method=smp"): 198.3,
 }
 
 

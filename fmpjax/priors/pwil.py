@@ -14,7 +14,6 @@ import jax.numpy as jnp
 
 from fmpjax import sharding, transport
 from fmpjax.config import Config
-from fmpjax.errors import UserError
 from fmpjax.priors.base import Expert, MotionPrior, Rollout
 
 
@@ -57,11 +56,6 @@ def make(expert: Expert, config: Config) -> MotionPrior:
     settings, windows = config.pwil, expert.windows
     steps = config.env.longest_episode
     step_mass = 1.0 / steps - settings.slack
-    if step_mass <= 0:
-        raise UserError(
-            f"setting pwil.slack is {settings.slack:g}: expected less than {1 / steps:g}, the mass of one of the "
-            f"{steps} steps that an episode has"
-        )
     full = jnp.full(len(windows), 1.0 / len(windows)) if expert.share is None else expert.share
     full = full.astype(jnp.float32)
 

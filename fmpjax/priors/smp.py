@@ -165,7 +165,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
             seen=jnp.where(share > 0, state.seen + len(pool), state.seen),
         )
         scores = exponent(state, error)
-        reward = jnp.exp(scores).reshape(rollout.valid.shape)
+        reward = settings.scale * jnp.exp(scores).reshape(rollout.valid.shape)
         reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
         low, middle, high = jnp.quantile(scores, jnp.array([0.25, 0.5, 0.75]))
         summary = {
