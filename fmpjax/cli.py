@@ -208,7 +208,7 @@ class Evaluate:
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     episodes: Annotated[int | None, default("the run's evaluation_episodes")] = None
-    """First episodes of the headline's starts; docs/metrics.md."""
+    """First episodes at the smallest perturbation, by which a run is judged; docs/metrics.md."""
     last: bool = False
     """Take the newest checkpoint in place of the best."""
 

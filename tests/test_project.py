@@ -122,3 +122,27 @@ def test_the_check_of_a_submission_lints_and_tests_and_installs_once(tmp_path):
     assert done.stdout.count(".[dev,viz,retarget]") == 1
     lint, first_test = done.stdout.index("nowhere/bin/ruff check"), done.stdout.index("-m pytest")
     assert done.stdout.index(".[dev,viz,retarget]") < lint < first_test
+
+
+def _pages():
+    return [
+        page for where in ("*.md", "docs/*.md", "experiments/**/*.md", "robots/**/*.md") for page in ROOT.glob(where)
+    ]
+
+
+def _headings(page: Path) -> set[str]:
+    """Anchors of a page's headings, as GitHub makes them."""
+    titles = re.findall(r"^#+ (.*)$", page.read_text(), flags=re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", _pages(), ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_links_of_the_pages_lead_somewhere(page):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        path, _, anchor = link.partition("#")
+        if re.match(r"[a-z]+:", link):
+            continue
+        target = page.parent / path if path else page
+        assert target.exists(), link
+        assert not anchor or target.suffix != ".md" or anchor in _headings(target), link
