@@ -78,7 +78,7 @@ def test_missing_specification_and_unknown_names(tmp_path):
     with pytest.raises(UserError, match="cannot read .*none.toml: No such file"):
         cells.read_specification(tmp_path / "none.toml")
     with pytest.raises(UserError, match="unknown method 'gan'"):
-        cells.plan(cells.Specification(methods=("gail",)))
+        cells.plan(cells.Specification(methods=("gan",)))
     with pytest.raises(UserError, match="unknown reset 'random'"):
         cells.plan(cells.Specification(resets=("random",)))
     with pytest.raises(UserError, match=r"unknown setting 'ppo.gamma'"):
