@@ -52,7 +52,7 @@ def couple(distance: jax.Array, mass: jax.Array, step: jax.Array | float) -> tup
 
 
 def make(expert: Expert, config: Config) -> MotionPrior:
-    """Primal Wasserstein Imitation Learning: each episode's greedy coupling to the demonstration, with no network."""
+    """Primal Wasserstein Imitation Learning: each episode's greedy coupling to the demonstration, no network."""
     settings, windows = config.pwil, expert.windows
     steps = config.env.longest_episode
     step_mass = 1.0 / steps - settings.slack

@@ -89,7 +89,7 @@ def denoising_error(denoise, x: jax.Array, noise: jax.Array, step: jax.Array, si
 
 
 def make(expert: Expert, config: Config) -> MotionPrior:
-    """Score-Matching Motion Prior: how well a diffusion model, pretrained on the demonstration and frozen, denoises."""
+    """Score-Matching Motion Prior: how well a frozen diffusion model of the demonstration denoises a window."""
     settings = config.smp
     network = Denoiser(expert.horizon, *SMP_NETWORKS[settings.network])
     optimizer = optax.chain(
