@@ -8,6 +8,6 @@ from fmpjax.priors.base import Expert, MotionPrior
 
 
 def make(expert: Expert, config: Config) -> MotionPrior:
-    """Generative Adversarial Imitation Learning: AMP's network without its penalties, reward -log(1 - sigmoid(D))."""
+    """Generative Adversarial Imitation Learning: AMP's network, no penalties, reward -log(1 - sigmoid(D))."""
     # softplus(l) = -log(1 - sigmoid(l)).
     return adversary.discriminator(expert, config.gail, jax.nn.softplus)

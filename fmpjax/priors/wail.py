@@ -43,7 +43,7 @@ def loss(apply, params, agent: jax.Array, demonstration: jax.Array, key: jax.Arr
 
 
 def make(expert: Expert, config: Config) -> MotionPrior:
-    """Wasserstein Adversarial Imitation Learning: a critic of slope one, its values standardized into the reward."""
+    """Wasserstein Adversarial Imitation Learning: a critic of slope one, whose values are standardized."""
     settings = config.wail
     critic = adversary.make(expert, settings, lambda *arguments: loss(*arguments, settings))
     newest = 1.0 - 0.5 ** (1.0 / settings.deviation_half_life)
