@@ -21,9 +21,8 @@ from fmpjax.motion import MotionClip, MotionLibrary
 from fmpjax.motion.clip import refined
 from fmpjax.robots import Robot
 
-# Faster than any joint or fall of a robot of this size, rad/s or m/s: such a state has blown up.
-_VELOCITY_LIMIT = 1e3
-_LIMITS = physics.PhysicsState(np.inf, _VELOCITY_LIMIT, np.inf)
+# What a state must stay below. No joint or fall of a robot of this size is as fast: such a state has blown up.
+_LIMITS = physics.PhysicsState(qpos=np.inf, qvel=1e3, warmstart=np.inf)  # m and rad, m/s and rad/s, m/s² and rad/s²
 
 
 # Fields of `EnvState` with a leading axis of environments.
@@ -201,7 +200,7 @@ class Env:
 
         def step(carry, inputs):
             sim, observed, age, window, offenders = carry
-            index, drawn, start, reset_key = inputs
+            index, drawn, start, fresh_window, reset_key = inputs
             action, extras = policy.act(observed.actor, drawn)
             here = Offender(sim.qpos, sim.qvel, action)
             sim, reached, fell, finite = self._advance(sim, action)
@@ -234,22 +233,23 @@ class Env:
                 sim,
                 observed,
                 choose(jnp.zeros_like(age), age),
-                choose(self.history_rows(start), window),
+                choose(fresh_window, window),
                 offenders,
             )
             return carry, record
 
-        # Random numbers of all steps at once: drawn step by step they are most of a small step's launches.
+        # Once for all steps: inside the loop, random numbers were most of what a small step launches.
         policy_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(key, steps))
         drawn = jax.vmap(lambda key: policy.draw(key, (count,)))(policy_keys)
         starts = jax.vmap(lambda key: self.reset_rows(key, count))(reset_keys)
+        fresh_windows = jax.vmap(self.history_rows)(starts)
         noise_keys = jax.vmap(lambda key: jax.random.fold_in(key, 2))(reset_keys)
         window = before + jnp.arange(count * self.horizon).reshape(count, self.horizon)
         nobody = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), state.offender)
         (sim, observed, age, window, offenders), record = jax.lax.scan(
             step,
             (state.physics, state.observed, state.age, window, nobody),
-            (jnp.arange(steps), drawn, starts, noise_keys),
+            (jnp.arange(steps), drawn, starts, fresh_windows, noise_keys),
         )
         # The last step's first.
         when = jnp.where(record.nonfinite, jnp.arange(1, steps + 1)[:, None], 0).max(0)
@@ -293,6 +293,6 @@ class Env:
 
 def _finite(sim: physics.PhysicsState) -> jax.Array:
     """Whether each environment's state is finite and has not blown up, ``[N]`` bool."""
-    # One array, one limit a column: not-a-number is below none.
+    # One comparison for all columns. It is false for NaN, and for infinity where the limit is infinity.
     limit = np.concatenate([np.full(x.shape[-1], most, np.float32) for x, most in zip(sim, _LIMITS, strict=True)])
     return (jnp.abs(jnp.concatenate(sim, axis=-1)) < limit).all(-1)

@@ -464,6 +464,16 @@ def test_actions_reach_the_physics_through_the_map():
     np.testing.assert_array_equal(sim.qpos[:, 7:], environments.action_map(ROBOT, CLIP, "residual")(action))
 
 
+def test_every_step_of_a_rollout_has_random_numbers_of_its_own():
+    """Drawn for all steps at once, they are those that each step would draw from its own key."""
+    built, key = make(), jax.random.PRNGKey(5)
+    policy = Policy(lambda observation, noise: (noise, {}), lambda key, shape: jax.random.normal(key, (*shape, JOINTS)))
+    _, record = built.rollout(built.reset(key), policy, key, 4)
+    for step_key, action in zip(jax.random.split(key, 4), record.action, strict=True):
+        policy_key, _ = jax.random.split(step_key)
+        np.testing.assert_array_equal(action, jax.random.normal(policy_key, (COUNT, JOINTS)))
+
+
 def test_a_step_launches_few_kernels():
     """A launch costs microseconds, whatever it computes: a step of 575 was a fifth of an iteration."""
     native = Env(ROBOT, CLIP, preset("laptop"), physics.make(ROBOT, preset("laptop").physics))

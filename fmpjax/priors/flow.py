@@ -14,7 +14,16 @@ import optax
 
 from fmpjax import potential, sharding, transport
 from fmpjax.config import Config, PriorConfig
-from fmpjax.priors.base import Coupling, Expert, MotionPrior, Rollout, couple_draws, flatten, median_reward
+from fmpjax.priors.base import (
+    Coupling,
+    Expert,
+    MotionPrior,
+    Rollout,
+    couple_draws,
+    flatten,
+    median_reward,
+    step_if_finite,
+)
 
 
 class FlowState(NamedTuple):
@@ -184,15 +193,10 @@ def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> Motio
         (total, stats), gradients = jax.value_and_grad(losses, has_aux=True)(
             params, query, teacher, flow, dimension, config
         )
-        norm = optax.global_norm(gradients)
-        updates, new_optimizer_state = optimizer.update(gradients, optimizer_state)
-        finite = jnp.isfinite(total) & jnp.isfinite(norm)
-        keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)  # noqa: E731
-        params = keep(optax.apply_updates(params, updates), params)
-        optimizer_state = keep(new_optimizer_state, optimizer_state)
+        params, optimizer_state, finite = step_if_finite(optimizer, params, optimizer_state, total, gradients)
         average = jax.tree.map(lambda a, p: a + newest * (p - a), average, params)
         metrics = stats | {
-            "gradient_norm": norm,
+            "gradient_norm": optax.global_norm(gradients),
             "epsilon": teacher.solution.epsilon,
             "sinkhorn_iterations": teacher.solution.iterations.max(),
             "unconverged": (~teacher.solution.converged).sum().astype(jnp.float32),
