@@ -7,11 +7,11 @@ from pathlib import Path
 # Before JAX is imported: the figures the tests compare are those of the CPU unless the caller says otherwise.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Four fake devices, on which programs that several devices share are tested; everything else runs on the first.
-# Compiling is most of the time: XLA's first level of optimization takes a quarter less of it.
-os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=4 --xla_backend_optimization_level=1")
-# Programs are compiled once for all processes of the tests, and for the next time.
+# Compiling is most of the time, and least of it without optimization.
+os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=4 --xla_backend_optimization_level=0")
+# Programs, the smallest too, are compiled once for all processes of the tests, and for the next time.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"fmpjax-tests-{os.getuid()}"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 # A device that waits for the others holds one of the threads of XLA, which makes one a core: too few are a deadlock.
 os.environ.setdefault("NPROC", str(2 * max(os.cpu_count() or 1, 4)))

@@ -71,12 +71,11 @@ def test_a_look_at_a_run(tmp_path):
     """All figures of a real, if tiny, run are there; shares are shares; a longer fit follows the transport better."""
     config = tiny(**{"env.count": 16, "ppo.rollout_steps": 16, "ppo.critic_batch": 4, "ppo.actor_batch": 4})
     trainer = Trainer(config, runs.load_motion(config))
-    state = trainer.iteration(trainer.init())[0]
-    seen = standing.gather(trainer, state, jax.random.PRNGKey(0))
+    state = jax.jit(trainer.iteration)(trainer.init())[0]
+    seen, figures = standing._examine(trainer, state, jax.random.PRNGKey(0))
     assert seen.speed.shape == (standing.ROLLOUTS * 16, 16)
     # Episodes begin in mid-stride: the first windows move as the demonstration does.
     assert 0.5 < float(seen.speed[0].mean()) < 1.2
-    figures = standing.gradients(trainer, state, seen) | standing.fits(trainer, state, seen, jax.random.PRNGKey(1))
     assert all(np.isfinite(float(value)) for value in figures.values())
     shares = [float(v) for k, v in figures.items() if k.startswith("gradient_share_") and not k.endswith("floored")]
     assert sum(shares) == pytest.approx(1.0, abs=1e-4)

@@ -573,8 +573,9 @@ def test_memory_that_runs_out_leaves_the_last_checkpoint_good(trained, tmp_path,
     assert capsys.readouterr().err.startswith("fmpjax: out of memory on ")
     monkeypatch.undo()
     assert runs.train(runs.Run.open(folder), resume=True) is runs.End.BUDGET
+    again = leaves(folder)
     for name, leaf in leaves(trained).items():
-        np.testing.assert_array_equal(leaves(folder)[name], leaf, err_msg=name)
+        np.testing.assert_array_equal(again[name], leaf, err_msg=name)
 
 
 @pytest.mark.parametrize(
