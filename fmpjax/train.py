@@ -16,6 +16,7 @@ from fmpjax import features, metrics, physics, priors, robots, sharding
 from fmpjax.config import Config
 from fmpjax.env import PER_ENVIRONMENT, Env, EnvState, Steps
 from fmpjax.errors import UserError
+from fmpjax.frames import FrameLayout
 from fmpjax.motion import MotionClip, MotionLibrary
 from fmpjax.ppo import PPO, Batch, PPOState
 
@@ -209,7 +210,7 @@ def _rollout_metrics(robot: robots.Robot, steps: Steps, reward: jax.Array) -> Me
         # NaN where no episode ended in the rollout; averages over a chunk leave it out.
         "train/episode_length": jnp.where(count > 0, (steps.length * ended).sum() / count, jnp.nan),
         "train/falls": jnp.where(count > 0, steps.fell.sum() / count, jnp.nan),
-        "train/speed": steps.frame[..., features.velocity_index(robot)].mean(),
+        "train/speed": steps.frame[..., FrameLayout.of(robot).velocity.start].mean(),
         "train/reward": reward.mean(),
         "train/reward_spread": high - low,
         "train/reward_median": middle,

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fmpjax import sharding, transport
+from fmpjax.frames import PLANAR
 from fmpjax.config import Config, PriorConfig
 from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten
 
@@ -25,13 +26,13 @@ class BarycentricState(NamedTuple):
 
 
 def split(windows: jax.Array, horizon: int) -> tuple[jax.Array, jax.Array]:
-    """What is matched ``[n, (H - 1)(F - 2)]`` and what is scored ``[n, F]`` of features ``[n, H F]``.
+    """What is matched, ``[n, (H - 1)(F - 2)]``, and what is scored, ``[n, F]``, of features ``[n, H F]``.
 
     The planar position of the preceding frames is left out: it is relative to the newest frame, and would tell where
     that frame is.
     """
     frames = windows.reshape(len(windows), horizon, -1)
-    return frames[:, :-1, 2:].reshape(len(windows), -1), frames[:, -1]
+    return frames[:, :-1, PLANAR.stop :].reshape(len(windows), -1), frames[:, -1]
 
 
 def match(source: jax.Array, condition: jax.Array, expert: Expert, config: PriorConfig):
