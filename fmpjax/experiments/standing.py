@@ -213,10 +213,8 @@ def fits(trainer: Trainer, state: TrainState, moments: Moments, key: jax.Array) 
     row["standing_push_gain"] = jnp.where(standing, gain, 0.0).sum() / jnp.maximum(standing.sum(), 1) / spread
     weight = truth.gradient**2
     frame = weight.reshape(len(query), trainer.env.horizon, -1)
-    start = 0
-    for name, size in _groups(trainer.robot).items():
-        row[f"gradient_share_{name}"] = frame[..., start : start + size].sum() / weight.sum()
-        start += size
+    for name, place in _groups(trainer.robot).items():
+        row[f"gradient_share_{name}"] = frame[..., place].sum() / weight.sum()
     floored = trainer.feature_map.deviation > deviations(trainer) * (1 + 1e-5)
     row["floored_coordinates"] = floored.mean()
     row["gradient_share_floored"] = (frame * floored).sum() / weight.sum()
@@ -299,7 +297,7 @@ def track(trainer: Trainer) -> dict[str, float]:
     def play(carried):
         def step(sim, inputs):
             action, q, v = inputs
-            sim, _, fell = env.advance(sim, action[None].astype(jnp.float32))
+            sim, _, fell, _ = env.advance(sim, action[None].astype(jnp.float32))
             error = sim.qpos[0, 7:] - q[7:]
             if carried:
                 sim = sim._replace(qpos=sim.qpos.at[0, :7].set(q[:7]), qvel=sim.qvel.at[0, :6].set(v[:6]))
