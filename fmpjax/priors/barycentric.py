@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from fmpjax import sharding, transport
-from fmpjax.frames import PLANAR
+from fmpjax import learning, sharding, transport
 from fmpjax.config import Config, PriorConfig
+from fmpjax.frames import PLANAR
 from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten
 
 
@@ -35,8 +34,14 @@ def split(windows: jax.Array, horizon: int) -> tuple[jax.Array, jax.Array]:
     return frames[:, :-1, PLANAR.stop :].reshape(len(windows), -1), frames[:, -1]
 
 
-def match(source: jax.Array, condition: jax.Array, expert: Expert, config: PriorConfig):
-    """Dual ``[m]`` of an expert bank's conditions against a source bank's, and the entropy coefficient."""
+def match(
+    source: jax.Array, condition: jax.Array, expert: Expert, config: PriorConfig
+) -> tuple[jax.Array, jax.Array, transport.Solve]:
+    """Transport of a source bank's conditions ``[n, C]`` to those of an expert bank, ``[m, C]``.
+
+    Returns:
+      The expert bank's dual ``[m]``, the entropy coefficient, and the whole solution, which tells of its convergence.
+    """
     cost = transport.squared_cost(source, condition)
 
     def solve(cost):
@@ -92,10 +97,8 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         reward = 2.0 * jnp.exp(scores).reshape(rollout.valid.shape)
         reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
         _, probability = target(state, split(source, expert.horizon)[0])
-        low, middle, high = jnp.quantile(scores, np.array([0.25, 0.5, 0.75]))
         summary = {
-            "score_median": middle,
-            "score_spread": high - low,
+            **learning.score_metrics(*learning.median_and_spread(scores)),
             "effective_atoms": (1.0 / jnp.sum(probability**2, axis=-1)).mean(),
             "epsilon": epsilon,
             "sinkhorn_iterations": solution.iterations[0].astype(jnp.float32),
