@@ -53,10 +53,11 @@ def network(hidden: tuple[int, ...], logit_init: float, dimension: float) -> lea
       logit_init: bound of the last layer's weights.
       dimension: d, coordinates of the full window.
     """
-    inputs = (dimension, *hidden)[: len(hidden)]
+    bounds = [1 / math.sqrt(inputs) for inputs in (dimension, *hidden)]
+    bounds[-1] = logit_init
     return learning.MLP(
         widths=(*hidden, 1),
-        kernel_inits=[learning.uniform(bound) for bound in (*(1 / math.sqrt(n) for n in inputs), logit_init)],
+        kernel_inits=[learning.uniform(bound) for bound in bounds],
         activation=linen.relu,
         names=(*(f"Dense_{i}" for i in range(len(hidden))), "logit"),
     )
