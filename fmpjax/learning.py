@@ -141,9 +141,9 @@ class Count(NamedTuple):
     hi: jax.Array  # scalar uint32
     lo: jax.Array  # scalar uint32
 
-    def __add__(self, more: int) -> "Count":
-        """The count ``more`` later, which has 32 bits."""
-        lo = self.lo + jnp.uint32(more)
+    def __add__(self, more: jax.Array) -> "Count":
+        """The count ``more`` later, a scalar uint32."""
+        lo = self.lo + more
         return Count(self.hi + (lo < self.lo), lo)
 
     def rounded(self) -> jax.Array:
@@ -168,7 +168,9 @@ class Statistics(NamedTuple):
 
     def after(self, rows: jax.Array, floor: float) -> "Statistics":
         """The statistics after ``rows [n, D]``, by Welford's formula; deviations are at least ``floor``."""
-        count = self.count + len(rows)
+        # A product that is taken in the program. XLA would divide by a number that it reads there through the reciprocal,
+        # which rounds otherwise: every seed would begin in another state.
+        count = self.count + jnp.prod(jnp.array(rows.shape[:1], jnp.uint32))
         total = count.rounded()
         off = rows - self.mean
         mean = self.mean + jnp.sum(off, axis=0) / total

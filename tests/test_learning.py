@@ -64,7 +64,7 @@ def test_a_step_is_taken_where_all_is_finite(rate, fault):
 
 @pytest.mark.parametrize("before", [0, 5, 2**32 - 8, 2**32 - 7, 2**33 + 1, 3 * 2**32 - 1])
 def test_a_count_goes_beyond_32_bits(before):
-    count = Count(jnp.uint32(before >> 32), jnp.uint32(before & 0xFFFFFFFF)) + 7
+    count = Count(jnp.uint32(before >> 32), jnp.uint32(before & 0xFFFFFFFF)) + jnp.uint32(7)
     assert (int(count.hi) << 32) + int(count.lo) == before + 7
     np.testing.assert_allclose(count.rounded(), before + 7, rtol=1e-7)
 
