@@ -168,8 +168,8 @@ class Statistics(NamedTuple):
 
     def after(self, rows: jax.Array, floor: float) -> "Statistics":
         """The statistics after ``rows [n, D]``, by Welford's formula; deviations are at least ``floor``."""
-        # A product that is taken in the program. XLA would divide by a number that it reads there through the reciprocal,
-        # which rounds otherwise: every seed would begin in another state.
+        # The program counts the rows. In place of a division by a constant, XLA multiplies by its reciprocal. That
+        # rounds otherwise, and every seed would begin in another state.
         count = self.count + jnp.prod(jnp.array(rows.shape[:1], jnp.uint32))
         total = count.rounded()
         off = rows - self.mean
