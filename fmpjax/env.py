@@ -50,6 +50,34 @@ class EnvState(NamedTuple):
     offender: Offender
 
 
+class Moment(NamedTuple):
+    """N environments between two control steps of a rollout."""
+
+    physics: physics.PhysicsState
+    observed: Observed  # of the present state
+    age: jax.Array  # [N] int32, steps since the reset
+    window: jax.Array  # [N, H] int32, frame table's rows of the frames up to the present one, oldest first
+    offender: Offender  # each environment's own in this rollout, [N, ...]
+
+
+class Drawn(NamedTuple):
+    """What a step needs beside the action. A rollout draws it for all of its steps at once."""
+
+    row: jax.Array  # [N] int32, frame table's rows of the frames after the step
+    start: jax.Array  # [N] int32, frame table's rows of the states at which new episodes begin
+    window: jax.Array  # [N, H] int32, frame table's rows of the histories up to there
+    key: jax.Array  # of the noise on those states
+
+
+class Reached(NamedTuple):
+    """What the physics of one control step reaches; the state before it where that is not finite."""
+
+    physics: physics.PhysicsState
+    observed: Observed
+    fell: jax.Array  # [N] bool, or not finite
+    finite: jax.Array  # [N] bool
+
+
 class Steps(NamedTuple):
     """A rollout: T steps of N environments."""
 
@@ -198,78 +226,78 @@ class Env:
         before = self.clip_rows + 1  # rows ahead of the frames before the rollout
         during = before + count * self.horizon  # rows ahead of the rollout's own frames
 
-        def step(carry, inputs):
-            sim, observed, age, window, offenders = carry
-            index, drawn, start, fresh_window, reset_key = inputs
-            action, extras = policy.act(observed.actor, drawn)
-            here = Offender(sim.qpos, sim.qvel, action)
-            sim, reached, fell, finite = self._advance(sim, action)
-            # Each environment keeps its own, which needs no word from the others while the rollout goes on.
-            offenders = jax.tree.map(lambda new, old: jnp.where(finite[:, None], old, new), here, offenders)
-            age = age + 1
-            timed_out = (age >= state.cap) & ~fell
-            rows = during + index * count + jnp.arange(count)
-            window = sharding.split(jnp.concatenate([window[:, 1:], rows[:, None]], axis=1))
-            record = Steps(
-                observation=observed.actor,
-                next_observation=reached.actor,
-                action=action,
-                extras=extras,
-                fell=fell,
-                timed_out=timed_out,
-                nonfinite=~finite,
-                length=age,
-                frame=reached.frame,
-                window=window,
-            )
-            done = fell | timed_out
-            begun = self._begin(start, reset_key)
-
-            def choose(fresh, old):
-                return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), fresh, old)
-
-            sim, observed = jax.tree.map(choose, begun, (sim, reached))
-            carry = (
-                sim,
-                observed,
-                choose(jnp.zeros_like(age), age),
-                choose(fresh_window, window),
-                offenders,
-            )
-            return carry, record
+        def play(now: Moment, inputs) -> tuple[Moment, Steps]:
+            noise, drawn = inputs
+            action, extras = policy.act(now.observed.actor, noise)
+            now, record = self.step(now, action, drawn, state.cap)
+            return now, record._replace(extras=extras)
 
         # Once for all steps: inside the loop, random numbers were most of what a small step launches.
         policy_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(key, steps))
-        drawn = jax.vmap(lambda key: policy.draw(key, (count,)))(policy_keys)
+        noise = jax.vmap(lambda key: policy.draw(key, (count,)))(policy_keys)
         starts = jax.vmap(lambda key: self.reset_rows(key, count))(reset_keys)
-        fresh_windows = jax.vmap(self.history_rows)(starts)
-        noise_keys = jax.vmap(lambda key: jax.random.fold_in(key, 2))(reset_keys)
-        window = before + jnp.arange(count * self.horizon).reshape(count, self.horizon)
-        nobody = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), state.offender)
-        (sim, observed, age, window, offenders), record = jax.lax.scan(
-            step,
-            (state.physics, state.observed, state.age, window, nobody),
-            (jnp.arange(steps), drawn, starts, fresh_windows, noise_keys),
+        drawn = Drawn(
+            row=during + jnp.arange(steps * count).reshape(steps, count),
+            start=starts,
+            window=jax.vmap(self.history_rows)(starts),
+            key=jax.vmap(lambda key: jax.random.fold_in(key, 2))(reset_keys),
         )
-        # The last step's first.
-        when = jnp.where(record.nonfinite, jnp.arange(1, steps + 1)[:, None], 0).max(0)
-        last = jnp.argmax(when)
-        offender = jax.tree.map(lambda new, old: jnp.where(when.any(), new[last], old), offenders, state.offender)
-        history = self.frame_table(state, record)[window]
-        new_state = state._replace(physics=sim, observed=observed, history=history, age=age, offender=offender)
+        window = before + jnp.arange(count * self.horizon).reshape(count, self.horizon)
+        offender = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), state.offender)
+        now = Moment(state.physics, state.observed, state.age, window, offender)
+        now, record = jax.lax.scan(play, now, (noise, drawn))
+        new_state = state._replace(
+            physics=now.physics,
+            observed=now.observed,
+            history=self.frame_table(state, record)[now.window],
+            age=now.age,
+            offender=_last_offender(now.offender, record.nonfinite, state.offender),
+        )
         return self._grow_cap(new_state, record), record
 
-    def advance(self, sim: physics.PhysicsState, action: jax.Array):
-        """One control step without resets: the state reached, what is observed of it, and who fell, ``[N]``."""
-        return self._advance(sim, action)[:3]
+    def step(self, now: Moment, action: jax.Array, drawn: Drawn, cap: jax.Array) -> tuple[Moment, Steps]:
+        """One control step, after which episodes that are over begin again.
 
-    def _advance(self, sim, action):
+        Args:
+          now: the environments before the step.
+          action: ``[N, J]`` normalised.
+          drawn: what the step needs beside the action.
+          cap: scalar, steps at which an episode times out.
+
+        Returns:
+          The environments before the next step, and the record of this one, each field ``[N, ...]``, with no extras.
+        """
+        reached = self.advance(now.physics, action)
+        age = now.age + 1
+        timed_out = (age >= cap) & ~reached.fell
+        window = sharding.split(jnp.concatenate([now.window[:, 1:], drawn.row[:, None]], axis=1))
+        record = Steps(
+            observation=now.observed.actor,
+            next_observation=reached.observed.actor,
+            action=action,
+            extras={},
+            fell=reached.fell,
+            timed_out=timed_out,
+            nonfinite=~reached.finite,
+            length=age,
+            frame=reached.observed.frame,
+            window=window,
+        )
+        done = reached.fell | timed_out
+        sim, observed = self._begin(drawn.start, drawn.key)
+        begun = sim, observed, jnp.zeros_like(age), drawn.window
+        after = reached.physics, reached.observed, age, window
+        kept = jax.tree.map(lambda new, old: jnp.where(_over(done, old), new, old), begun, after)
+        return Moment(*kept, offender=_offender(now, action, reached.finite)), record
+
+    def advance(self, sim: physics.PhysicsState, action: jax.Array) -> Reached:
+        """The physics of one control step under normalised actions ``[N, J]``, whatever the episodes."""
         reached = sharding.per_device(self.physics.step)(sim, self.actions(action))
         finite = _finite(reached)
         # Non-finite numbers must not reach the observation, not even to be discarded: the state before stays.
         sim = jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), reached, sim)
         observed = self._observe(sim.qpos, sim.qvel)
-        return sim, observed, observed.fallen | ~finite, finite
+        return Reached(sim, observed, observed.fallen | ~finite, finite)
 
     def frame_table(self, state: EnvState, record: Steps) -> jax.Array:
         """Frames ``[rows, F]`` that the windows of a rollout begun in ``state`` index."""
@@ -289,6 +317,25 @@ class Env:
         grow = (share > config.cap_share) & (cap_age >= config.cap_patience) & (state.cap < last)
         cap = jnp.where(grow, jnp.minimum(jnp.ceil(state.cap * config.cap_growth), last), state.cap)
         return state._replace(cap=cap, capped_share=share, cap_age=jnp.where(grow, 0, cap_age))
+
+
+def _over(chosen: jax.Array, values: jax.Array) -> jax.Array:
+    """``chosen [N]`` with as many axes as ``values [N, ...]``."""
+    return chosen.reshape(-1, *[1] * (values.ndim - 1))
+
+
+def _offender(now: Moment, action: jax.Array, finite: jax.Array) -> Offender:
+    """Each environment's last offender after a step that left ``finite [N]`` of them finite."""
+    # Each keeps its own, which needs no word from the others while the rollout goes on.
+    here = Offender(now.physics.qpos, now.physics.qvel, action)
+    return jax.tree.map(lambda new, old: jnp.where(finite[:, None], old, new), here, now.offender)
+
+
+def _last_offender(offenders: Offender, nonfinite: jax.Array, before: Offender) -> Offender:
+    """The newest of the offenders ``[N, ...]`` of a rollout, the first of those of one step; else the one before."""
+    when = jnp.where(nonfinite, jnp.arange(1, len(nonfinite) + 1)[:, None], 0).max(0)
+    last = jnp.argmax(when)
+    return jax.tree.map(lambda new, old: jnp.where(when.any(), new[last], old), offenders, before)
 
 
 def _finite(sim: physics.PhysicsState) -> jax.Array:

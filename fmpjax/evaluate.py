@@ -175,16 +175,16 @@ class Evaluator:
             sim, observed, alive, length = carry
             with self.trainer.precision():
                 action, _ = policy(observed.actor, None)
-            reached, observation, fell = env.advance(sim, action)
-            still_alive = alive & ~fell
+            reached = env.advance(sim, action)
+            still_alive = alive & ~reached.fell
             length = length + alive
 
             def hold(new, old):
                 # The step on which a robot falls is part of its episode; after it nothing moves.
                 return jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-            sim = jax.tree.map(hold, reached, sim)
-            observed = jax.tree.map(hold, observation, observed)
+            sim = jax.tree.map(hold, reached.physics, sim)
+            observed = jax.tree.map(hold, reached.observed, observed)
             return (sim, observed, still_alive, length), (sim.qpos[:headline], sim.qvel[:headline])
 
         alive = jnp.ones(len(self.rows), bool)

@@ -17,6 +17,7 @@ import numpy as np
 from fmpjax import kinematics, rotations
 from fmpjax.config import FeatureConfig
 from fmpjax.errors import UserError
+from fmpjax.frames import FORWARD, PLANAR, FrameLayout
 from fmpjax.robots import Robot
 
 
@@ -87,19 +88,30 @@ def actor_observation(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Arr
       qpos: ``[..., 7 + J]`` root xyz, quaternion wxyz, joints.
       qvel: ``[..., 6 + J]`` root velocity in the world, root angular velocity in the body, joint velocities.
     """
-    p = _parts(robot, qpos, qvel)
-    return jnp.concatenate(
-        [
-            p.root[..., 2:],
-            p.rotation,
-            p.velocity,
-            p.angular_velocity,
-            _joint_rotations(robot, p.joints),
-            p.joint_velocity,
-            p.key_points,
-        ],
-        axis=-1,
-    )
+    return _observation(robot, _parts(robot, qpos, qvel), "full")
+
+
+def observation_terms(robot: Robot, observation: str) -> dict[str, int]:
+    """Names and widths of the parts of the policy's observation, in their order."""
+    joints = robot.joint_count
+    angles = {"joint_rotation_6d": 6 * _rotations(robot)} if observation == "full" else {"joint_position": joints}
+    root = {"root_height": 1, "root_rotation_6d": 6, "root_linear_velocity": 3, "root_angular_velocity": 3}
+    return root | angles | {"joint_velocity": joints, "key_points": 3 * len(robot.key_body)}
+
+
+def _observation(robot: Robot, p: _Parts, observation: str) -> jax.Array:
+    parts = {
+        "root_height": p.root[..., 2:],
+        "root_rotation_6d": p.rotation,
+        "root_linear_velocity": p.velocity,
+        "root_angular_velocity": p.angular_velocity,
+        "joint_position": p.joints,
+        "joint_velocity": p.joint_velocity,
+        "key_points": p.key_points,
+    }
+    if observation == "full":
+        parts["joint_rotation_6d"] = _joint_rotations(robot, p.joints)
+    return jnp.concatenate([parts[name] for name in observation_terms(robot, observation)], axis=-1)
 
 
 def prior_window(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
@@ -142,47 +154,27 @@ def observe(robot: Robot, qpos: jax.Array, qvel: jax.Array, observation: str) ->
     """The policy's observation, the compact frame and the fall test of states ``qpos``, ``qvel``."""
     poses = kinematics.body_poses(robot, qpos)
     p = _parts(robot, qpos, qvel, poses)
-    if observation == "full":
-        joints = [_joint_rotations(robot, p.joints), p.joint_velocity]
-    else:
-        joints = [p.joints, p.joint_velocity]
-    actor = jnp.concatenate(
-        [p.root[..., 2:], p.rotation, p.velocity, p.angular_velocity, *joints, p.key_points], axis=-1
+    frame = FrameLayout.join(
+        root=p.root,
+        rotation=p.rotation,
+        cosine=jnp.cos(p.joints),
+        sine=jnp.sin(p.joints),
+        key_points=p.key_points,
+        velocity=p.velocity,
+        angular_velocity=p.angular_velocity,
+        joint_velocity=p.joint_velocity,
     )
-    frame = jnp.concatenate(
-        [
-            p.root,
-            p.rotation,
-            jnp.cos(p.joints),
-            jnp.sin(p.joints),
-            p.key_points,
-            p.velocity,
-            p.angular_velocity,
-            p.joint_velocity,
-        ],
-        axis=-1,
-    )
-    return Observed(actor, frame, kinematics.fallen(robot, poses))
+    return Observed(_observation(robot, p, observation), frame, kinematics.fallen(robot, poses))
 
 
-def observation_terms(robot: Robot, observation: str) -> dict[str, int]:
-    """Names and widths of the parts of the policy's observation, in the order in which `observe` puts them."""
-    joints = robot.joint_count
-    rows = joints + (robot.jointless_row is not None)
-    angles = {"joint_rotation_6d": 6 * rows} if observation == "full" else {"joint_position": joints}
-    root = {"root_height": 1, "root_rotation_6d": 6, "root_linear_velocity": 3, "root_angular_velocity": 3}
-    return root | angles | {"joint_velocity": joints, "key_points": 3 * len(robot.key_body)}
+def _rotations(robot: Robot) -> int:
+    """Joint rotations in a full frame, of which a jointless body has one."""
+    return robot.joint_count + (robot.jointless_row is not None)
 
 
 def frame_size(robot: Robot) -> int:
-    """Numbers in a full frame of the prior, 239 for the G1."""
-    rows = robot.joint_count + (robot.jointless_row is not None)
-    return 3 + 6 + 6 * rows + 3 * len(robot.key_body) + 3 + 3 + robot.joint_count
-
-
-def velocity_index(robot: Robot) -> int:
-    """Where the root's velocity along x (m/s) stands in a compact frame."""
-    return 9 + 2 * robot.joint_count + 3 * len(robot.key_body)
+    """Numbers in a full frame of the prior, 239 for the G1: 6D rotations in place of cosines and sines."""
+    return FrameLayout.of(robot).size - 2 * robot.joint_count + 6 * _rotations(robot)
 
 
 def compact_weights(robot: Robot) -> np.ndarray:
@@ -190,15 +182,10 @@ def compact_weights(robot: Robot) -> np.ndarray:
     cosine, sine, _ = _rotation_terms(robot)
     if not np.isin(np.abs(robot.joint_axis), (0, 1)).all():
         raise UserError(f"robot {robot.name} has a hinge off its body's axes: compact frames need axes along x, y or z")
-    ones = np.ones
-    return np.concatenate(
-        [
-            ones(9),
-            np.linalg.norm(cosine, axis=-1),
-            np.linalg.norm(sine, axis=-1),
-            ones(3 * len(robot.key_body) + 6 + robot.joint_count),
-        ]
-    )
+    layout = FrameLayout.of(robot)
+    weights = np.ones(layout.size)
+    weights[layout.cosine], weights[layout.sine] = np.linalg.norm(cosine, axis=-1), np.linalg.norm(sine, axis=-1)
+    return weights
 
 
 class _Planar(NamedTuple):
@@ -209,13 +196,10 @@ class _Planar(NamedTuple):
 
 
 def _planar(robot: Robot) -> _Planar:
-    velocities = velocity_index(robot)
-    keys = range(9 + 2 * robot.joint_count, velocities, 3)
-    x = np.array([0, 3, 6, *keys, velocities, velocities + 3])
-    other, sign = (
-        np.arange(velocities + 6 + robot.joint_count),
-        np.zeros(velocities + 6 + robot.joint_count, np.float32),
-    )
+    layout = FrameLayout.of(robot)
+    vectors = layout.root, layout.rotation, layout.key_points, layout.velocity, layout.angular_velocity
+    x = np.concatenate([np.arange(part.start, part.stop, 3) for part in vectors])
+    other, sign = np.arange(layout.size), np.zeros(layout.size, np.float32)
     other[x], other[x + 1] = x + 1, x
     sign[x], sign[x + 1] = 1.0, -1.0
     return _Planar(other, sign)
@@ -223,7 +207,7 @@ def _planar(robot: Robot) -> _Planar:
 
 def turned_windows(windows: jax.Array, planar: _Planar) -> jax.Array:
     """Relative windows ``[..., H, F]`` in axes of which x points where the newest frame's root does."""
-    forward = windows[..., -1:, 3:5]
+    forward = windows[..., -1:, FORWARD]
     cosine, sine = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
     turned = windows * cosine + windows[..., planar.other] * planar.sign * sine
     return jnp.where(planar.sign == 0, windows, turned)
@@ -231,7 +215,7 @@ def turned_windows(windows: jax.Array, planar: _Planar) -> jax.Array:
 
 def relative_windows(frames: jax.Array) -> jax.Array:
     """Windows ``[..., H, F]`` of compact frames with x and y made relative to the newest frame."""
-    return frames.at[..., :2].add(-frames[..., -1:, :2])
+    return frames.at[..., PLANAR].add(-frames[..., -1:, PLANAR])
 
 
 class FeatureMap(NamedTuple):
@@ -268,9 +252,9 @@ def fit_feature_map(
     relative = np.asarray(_placed(windows, planar), np.float64)
     mean = relative.mean(0) if share is None else np.average(relative, axis=0, weights=share)
     deviation = np.sqrt(np.average((relative - mean) ** 2, axis=0, weights=share))
-    floor = np.full(relative.shape[-1], config.deviation_floor)
-    # The last coordinates of a frame: the root's angular velocity, then the joints'.
-    floor[-(3 + robot.joint_count) :] = config.angular_velocity_floor
+    layout = FrameLayout.of(robot)
+    floor = np.full(layout.size, config.deviation_floor)
+    floor[layout.angular_velocity] = floor[layout.joint_velocity] = config.angular_velocity_floor
     return FeatureMap(
         mean=jnp.asarray(mean, jnp.float32),
         deviation=jnp.asarray(np.maximum(deviation, floor), jnp.float32),

@@ -64,16 +64,14 @@ class Policy(NamedTuple):
 def of(trainer: "Trainer", state: "PPOState") -> Policy:
     """The policy of a training state."""
     config, robot, actions = trainer.config, trainer.robot, trainer.env.actions
-    networks = state.actor["params"]
-    hidden = [networks["MLP_0"][f"hidden_{i}"] for i in range(len(config.ppo.hidden))]
-    layers = [*hidden, networks["Dense_0"]]
+    kernels, biases = zip(*trainer.ppo.layers(state.actor), strict=True)
     return Policy(
         joint_names=tuple(robot.joint_names),
         observation=config.env.observation,
         rate=float(config.control_rate),
         activation=config.ppo.activation,
-        kernels=tuple(np.asarray(layer["kernel"]) for layer in layers),
-        biases=tuple(np.asarray(layer["bias"]) for layer in layers),
+        kernels=kernels,
+        biases=biases,
         mean=np.asarray(state.normalizer.mean),
         deviation=np.asarray(state.normalizer.std),
         clip=float(config.ppo.normalizer_clip),

@@ -1,26 +1,21 @@
 """Proximal policy optimisation (section IV-A of the paper; the settings are MimicKit's).
 
-Networks, the action distribution and the running observation statistics are Brax's. An update fits the critic to
-TD(lambda) returns first and then improves the actor, each for its own number of epochs.
+An update fits the critic to TD(lambda) returns first and then improves the actor, each for its own number of epochs.
 """
 
-import contextlib
-import io
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import linen
 
-with contextlib.redirect_stdout(io.StringIO()):  # where MJX, which Brax imports, says that Warp is not installed
-    from brax.training import distribution, networks
-    from brax.training.acme import running_statistics
-    from brax.training.types import UInt64
-
-from fmpjax import sharding
+from fmpjax import learning, sharding
 from fmpjax.acting import Policy
 from fmpjax.config import PPOConfig
+from fmpjax.learning import MLP, Statistics
 
 
 class PPOState(NamedTuple):
@@ -30,7 +25,7 @@ class PPOState(NamedTuple):
     critic: Any
     actor_optimizer: optax.OptState
     critic_optimizer: optax.OptState
-    normalizer: running_statistics.RunningStatisticsState
+    normalizer: Statistics  # of the observations
     rate: jax.Array  # scalar, learning rate of both
 
 
@@ -48,6 +43,33 @@ class Batch(NamedTuple):
     age: jax.Array | None = None  # [T, N] int, steps of the episode up to and including this one
 
 
+class Actor(linen.Module):
+    """Mean and deviation ``[..., J]`` of the action distribution, of normalized observations ``[..., O]``.
+
+    The deviation is one learned number per joint, whatever is observed.
+    """
+
+    size: int  # J
+    hidden: Sequence[int]
+    activation: Callable[[jax.Array], jax.Array]
+    kernel_init: learning.Initializer  # of the hidden layers
+    mean_init: float  # bound of the last layer's weights
+    deviation: float  # initial
+
+    @linen.compact
+    def __call__(self, x):
+        inits = [self.kernel_init] * len(self.hidden)
+        x = MLP(self.hidden, inits, self.activation, activate_last=True, name=_TRUNK)(x)
+        mean = linen.Dense(self.size, kernel_init=learning.uniform(self.mean_init), name=_MEAN)(x)
+        start = lambda key: {"log_value": jnp.full((self.size,), jnp.log(self.deviation))}  # noqa: E731
+        deviation = jnp.exp(self.param(_DEVIATION, start)["log_value"])
+        return mean, jnp.broadcast_to(deviation, mean.shape)
+
+
+# The actor's parameters; checkpoints hold these names.
+_TRUNK, _MEAN, _DEVIATION = "MLP_0", "Dense_0", "std_logparam"
+
+
 class PPO:
     """Pure functions of the networks that a configuration describes.
 
@@ -59,72 +81,41 @@ class PPO:
     def __init__(self, observation_size: int, action_size: int, config: PPOConfig, clock: int = 0):
         self.config, self.clock = config, clock
         self.observation_size, self.action_size = observation_size, action_size
-        activation = elu if config.activation == "elu" else getattr(linen, config.activation)
-        initializers = jax.nn.initializers
+        activation, initializers = learning.activation(config.activation), jax.nn.initializers
         # Otherwise uniform within 1 / sqrt(inputs), PyTorch's way.
         uniform = initializers.variance_scaling(1 / 3, "fan_in", "uniform")
         kernel = initializers.orthogonal(2.0**0.5) if config.orthogonal else uniform
-
-        def normalize(observation, statistics):
-            return running_statistics.normalize(observation, statistics, max_abs_value=config.normalizer_clip)
-
-        bound = config.mean_init
-        self._policy = networks.make_policy_network(
-            action_size,
-            observation_size,
-            preprocess_observations_fn=normalize,
-            hidden_layer_sizes=config.hidden,
-            activation=activation,
-            kernel_init=kernel,
-            distribution_type="normal",
-            noise_std_type="log",
-            init_noise_std=config.deviation,
-            mean_kernel_init=lambda key, shape, dtype=jnp.float32: jax.random.uniform(key, shape, dtype, -bound, bound),
-        )
-
-        def normalize_timed(observation, statistics):
-            observed, over = observation[..., :observation_size], observation[..., observation_size:]
-            return jnp.concatenate([normalize(observed, statistics), over], axis=-1)
-
-        self._value = networks.make_value_network(
-            observation_size + bool(clock),
-            preprocess_observations_fn=normalize_timed if clock else normalize,
-            hidden_layer_sizes=config.hidden,
-            activation=activation,
-            kernel_init=kernel,
-        )
-        self._distribution = distribution.NormalDistribution(action_size)
-        direction = optax.scale_by_adam() if config.optimizer == "adam" else optax.trace(config.momentum)
+        self._actor = Actor(action_size, config.hidden, activation, kernel, config.mean_init, config.deviation)
+        widths = (*config.hidden, 1)
+        self._critic = MLP(widths, [kernel] * len(widths), activation)
         clip = [optax.clip_by_global_norm(config.clip_norm)] if config.clip_norm else []
-        self._optimizer = optax.chain(*clip, direction)
+        self._optimizer = optax.chain(*clip, learning.direction(config.optimizer, config.momentum))
 
     def init(self, key: jax.Array, observations: jax.Array | None = None) -> PPOState:
         """Initial state; ``observations [M, O]`` start the running statistics where the configuration asks for it."""
         actor_key, critic_key = jax.random.split(key)
-        actor, critic = self._policy.init(actor_key), self._value.init(critic_key)
-        normalizer = running_statistics.init_state(jnp.zeros(self.observation_size))
+        actor = self._actor.init(actor_key, jnp.zeros((1, self.observation_size)))
+        critic = self._critic.init(critic_key, jnp.zeros((1, self.observation_size + bool(self.clock))))
+        normalizer = Statistics.empty(self.observation_size)
         if self.config.normalizer_from_clip and observations is not None:
             normalizer = self.observe(normalizer, jnp.asarray(observations))
         optimizer = self._optimizer
         rate = jnp.float32(self.config.learning_rate)
         return PPOState(actor, critic, optimizer.init(actor), optimizer.init(critic), normalizer, rate)
 
-    def observe(self, normalizer, observations: jax.Array):
+    def observe(self, normalizer: Statistics, observations: jax.Array) -> Statistics:
         """Running statistics after ``observations [..., O]``."""
         flat = observations.reshape(-1, observations.shape[-1])
-        normalizer = running_statistics.update(normalizer, flat, std_min_value=self.config.normalizer_floor)
-        cap = self.config.normalizer_count
-        if not cap:
-            return normalizer
-        # A capped count keeps the statistics following the policy: old observations fade at the rate of new ones.
-        count = normalizer.count.hi.astype(jnp.float32) * 2.0**32 + normalizer.count.lo.astype(jnp.float32)
-        fade = jnp.minimum(1.0, cap / jnp.maximum(count, 1.0))
-        count = UInt64(normalizer.count.hi * 0, jnp.minimum(normalizer.count.lo, jnp.uint32(cap)))
-        return normalizer.replace(count=count, summed_variance=normalizer.summed_variance * fade)
+        normalizer = normalizer.after(flat, self.config.normalizer_floor)
+        # A capped count keeps the statistics following the policy.
+        return normalizer.capped(self.config.normalizer_count) if self.config.normalizer_count else normalizer
 
-    def policy(self, actor, normalizer, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def _normalized(self, normalizer: Statistics, observation: jax.Array) -> jax.Array:
+        return learning.standardize(observation, normalizer.mean, normalizer.std, self.config.normalizer_clip)
+
+    def policy(self, actor, normalizer: Statistics, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Mean and deviation ``[..., J]`` of the action distribution."""
-        mean, deviation = self._policy.apply(normalizer, actor, observation)
+        mean, deviation = self._actor.apply(actor, self._normalized(normalizer, observation))
         return mean, deviation if self.config.learn_deviation else jax.lax.stop_gradient(deviation)
 
     def act(self, state: PPOState, deterministic: bool = False) -> Policy:
@@ -140,12 +131,21 @@ class PPO:
 
         return Policy(act, draw)
 
+    def layers(self, actor) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Kernel ``[in, out]`` and bias ``[out]`` of each layer of the actor, the last of which gives the mean."""
+        parameters = actor["params"]
+        hidden = [parameters[_TRUNK][f"hidden_{i}"] for i in range(len(self.config.hidden))]
+        return [(np.asarray(layer["kernel"]), np.asarray(layer["bias"])) for layer in (*hidden, parameters[_MEAN])]
+
     def value(self, state: PPOState, observation: jax.Array, age: jax.Array | None = None) -> jax.Array:
         """Value estimates ``[...]`` after ``age [...]`` steps of an episode, which only a critic with a clock reads."""
-        return self._value.apply(state.normalizer, state.critic, self._critic_input(observation, age))
+        return self._values(state.critic, state.normalizer, observation, age)
 
-    def _critic_input(self, observation, age):
-        return jnp.concatenate([observation, age[..., None] / self.clock], axis=-1) if self.clock else observation
+    def _values(self, critic, normalizer: Statistics, observation, age):
+        x = self._normalized(normalizer, observation)
+        if self.clock:
+            x = jnp.concatenate([x, age[..., None] / self.clock], axis=-1)
+        return jnp.squeeze(self._critic.apply(critic, x), axis=-1)
 
     def update(self, state: PPOState, batch: Batch, key: jax.Array) -> tuple[PPOState, dict[str, jax.Array]]:
         """One PPO update from a rollout."""
@@ -172,8 +172,8 @@ class PPO:
 
         def critic_loss(params, sample):
             samples, target, _ = sample
-            seen = self._critic_input(samples.observation, None if samples.age is None else samples.age - 1)
-            error = self._value.apply(state.normalizer, params, seen) - target
+            age = None if samples.age is None else samples.age - 1
+            error = self._values(params, state.normalizer, samples.observation, age) - target
             # Adam with a clipped norm needs a loss of order one; plain SGD takes MimicKit's loss as it is.
             scale = 0.5 / (1.0 + return_variance) if config.optimizer == "adam" else 1.0
             return scale * jnp.mean(error**2), {}
@@ -186,16 +186,12 @@ class PPO:
         def actor_loss(params, sample):
             samples, _, gain = sample
             mean, deviation = self.policy(params, state.normalizer, samples.observation)
-            log_ratio = self._distribution.log_prob((mean, deviation), samples.action) - self._distribution.log_prob(
-                (samples.mean, samples.deviation), samples.action
-            )
-            ratio = jnp.exp(log_ratio)
+            old = log_probability(samples.action, samples.mean, samples.deviation)
+            ratio = jnp.exp(log_probability(samples.action, mean, deviation) - old)
             clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
             surrogate = -jnp.mean(jnp.minimum(ratio * gain, clipped * gain))
             bound = jnp.mean(jnp.sum(jnp.maximum(jnp.abs(mean) - 1.0, 0.0) ** 2, axis=-1))
-            kl = self._distribution.create_dist((mean, deviation)).kl_divergence(
-                self._distribution.create_dist((samples.mean, samples.deviation))
-            )
+            kl = kl_divergence(samples.mean, samples.deviation, mean, deviation)
             stats = {
                 "kl": jnp.mean(kl),
                 "clipped": jnp.mean((jnp.abs(ratio - 1.0) > config.clip).astype(ratio.dtype)),
@@ -245,15 +241,11 @@ class PPO:
             params, optimizer_state = carry
             sample = sharding.split(jax.tree.map(lambda x: x[indices], flat))
             (value, stats), gradients = grad(params, sample)
-            norm = optax.global_norm(gradients)
-            direction, new_optimizer_state = self._optimizer.update(gradients, optimizer_state)
-            new_params = jax.tree.map(lambda p, d: p - rate * d, params, direction)
-            finite = jnp.isfinite(value) & jnp.isfinite(norm)
-            carry = jax.tree.map(lambda new, old: jnp.where(finite, new, old), (new_params, new_optimizer_state), carry)
-            stats = stats | {"loss": value, "gradient_norm": norm, "skipped": (~finite).astype(jnp.float32)}
-            return carry, stats
+            step = learning.step_if_finite(self._optimizer, params, optimizer_state, value, gradients, rate)
+            stats = stats | {"loss": value, "gradient_norm": step.gradient_norm, "skipped": step.skipped}
+            return (step.params, step.optimizer), stats
 
-        order = jax.vmap(lambda k: permutation(k, count))(jax.random.split(key, epochs))
+        order = jax.vmap(lambda k: learning.permutation(k, count))(jax.random.split(key, epochs))
         order = order.reshape(epochs * minibatches, -1)
         (params, optimizer_state), stats = jax.lax.scan(descend, (params, optimizer_state), order)
         summary = {name: values[-minibatches:].mean() for name, values in stats.items()}
@@ -261,27 +253,20 @@ class PPO:
         return params, optimizer_state, summary
 
 
-@jax.custom_jvp
-def elu(x: jax.Array) -> jax.Array:
-    """Exponential linear unit; its derivative comes from its value, so the exponential is taken once."""
-    return jnp.where(x > 0, x, jnp.exp(jnp.minimum(x, 0.0)) - 1.0)
+def log_probability(action: jax.Array, mean: jax.Array, deviation: jax.Array) -> jax.Array:
+    """Logarithm of the density ``[...]`` of actions ``[..., J]`` whose joints are normal and independent."""
+    density = -0.5 * jnp.square(action / deviation - mean / deviation)
+    return jnp.sum(density - (0.5 * jnp.log(2.0 * jnp.pi) + jnp.log(deviation)), axis=-1)
 
 
-@elu.defjvp
-def _elu_jvp(primals, tangents):
-    y = elu(*primals)
-    return y, tangents[0] * jnp.where(y > 0, 1.0, y + 1.0)
+def kl_divergence(old_mean, old_deviation, mean, deviation) -> jax.Array:
+    """Divergence ``[...]`` of the old normal distribution from the new one, each ``[..., J]``.
 
-
-def permutation(key: jax.Array, count: int) -> jax.Array:
-    """A random order of ``count`` rows, by one sort of random numbers whose last bits are the rows.
-
-    `jax.random.permutation` sorts pairs, and twice. Rows that share their random bits, one in five of 32,768, keep the
-    order among themselves that they have in the rollout.
+    The ratio of deviations is off by 1e-5: two equal distributions are J * 1e-5 apart.
     """
-    bits = (count - 1).bit_length()
-    drawn = jax.random.bits(key, (count,)) >> bits << bits
-    return (jnp.sort(drawn | jnp.arange(count, dtype=jnp.uint32)) & (2**bits - 1)).astype(jnp.int32)
+    squares = jnp.square(old_deviation) + jnp.square(old_mean - mean)
+    terms = jnp.log(deviation / old_deviation + 1e-5) + squares / (2.0 * jnp.square(deviation)) - 0.5
+    return jnp.sum(terms, axis=-1)
 
 
 def generalized_advantage(
@@ -314,9 +299,6 @@ def adapt_rate(rate: jax.Array, kl: jax.Array, target: float) -> jax.Array:
 
 def _floor_deviation(actor, least: float):
     """The actor with its learned log-deviations at least log(least)."""
-
-    def floor(path, leaf):
-        named = any("std_logparam" in str(getattr(part, "key", part)) for part in path)
-        return jnp.maximum(leaf, jnp.log(least)) if named else leaf
-
-    return jax.tree_util.tree_map_with_path(floor, actor)
+    parameters = actor["params"]
+    floored = jax.tree.map(lambda value: jnp.maximum(value, jnp.log(least)), parameters[_DEVIATION])
+    return {**actor, "params": {**parameters, _DEVIATION: floored}}

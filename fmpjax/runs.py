@@ -38,7 +38,7 @@ try:
 except ImportError:  # on Windows, where every command says that it does not run
     fcntl = None
 
-_PACKAGES = "jax jaxlib mujoco mujoco-mjx brax flax optax ott-jax orbax-checkpoint numpy".split()
+_PACKAGES = "jax jaxlib mujoco mujoco-mjx flax optax ott-jax orbax-checkpoint numpy".split()
 
 _SAVE_INTERVAL = 120.0  # s between checkpoints at most, but for the iterations in hand
 

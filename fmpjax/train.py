@@ -12,10 +12,11 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from fmpjax import features, metrics, physics, priors, robots, sharding
+from fmpjax import features, learning, metrics, physics, priors, robots, sharding
 from fmpjax.config import Config
 from fmpjax.env import PER_ENVIRONMENT, Env, EnvState, Steps
 from fmpjax.errors import UserError
+from fmpjax.frames import FrameLayout
 from fmpjax.motion import MotionClip, MotionLibrary
 from fmpjax.ppo import PPO, Batch, PPOState
 
@@ -111,15 +112,15 @@ class Trainer:
         ppo, ppo_metrics = self.ppo.update(state.ppo, _batch(steps, reward), ppo_key)
         skipped = prior_metrics.get("skipped", 0.0) + ppo_metrics["skipped"]
         nonfinite = state.nonfinite + steps.nonfinite.sum().astype(jnp.int32) + jnp.int32(skipped)
-        metrics = (
+        figures = (
             _rollout_metrics(self.robot, steps, reward)
             | {f"env/{name}": getattr(env, name) for name in ("cap", "capped_share")}
             | {f"fit/{name}": value for name, value in prior_metrics.items()}
             | {f"ppo/{name}": value for name, value in ppo_metrics.items()}
             | {"train/nonfinite": nonfinite}
         )
-        metrics = {name: jnp.asarray(value, jnp.float32) for name, value in metrics.items()}
-        return TrainState(ppo, prior, env, key, state.iteration + 1, nonfinite), metrics
+        figures = {name: jnp.asarray(value, jnp.float32) for name, value in figures.items()}
+        return TrainState(ppo, prior, env, key, state.iteration + 1, nonfinite), figures
 
     def compile(self, state: TrainState) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
         """The compiled program of a run: ``config.chunk`` iterations, metrics averaged over them.
@@ -129,8 +130,8 @@ class Trainer:
         """
 
         def chunk(state: TrainState) -> tuple[TrainState, Metrics]:
-            state, metrics = jax.lax.scan(self.iteration, state, None, length=self.config.chunk)
-            return state, jax.tree.map(jnp.nanmean, metrics)
+            state, figures = jax.lax.scan(self.iteration, state, None, length=self.config.chunk)
+            return state, jax.tree.map(jnp.nanmean, figures)
 
         over = sharding.of(state.iteration)
         if state.iteration.ndim:
@@ -204,13 +205,13 @@ def _batch(steps: Steps, reward: jax.Array) -> Batch:
 def _rollout_metrics(robot: robots.Robot, steps: Steps, reward: jax.Array) -> Metrics:
     ended = steps.fell | steps.timed_out
     count = ended.sum()
-    low, middle, high = jnp.quantile(reward, jnp.array([0.25, 0.5, 0.75]))
+    median, spread = learning.median_and_spread(reward)
     return {
         # NaN where no episode ended in the rollout; averages over a chunk leave it out.
         "train/episode_length": jnp.where(count > 0, (steps.length * ended).sum() / count, jnp.nan),
         "train/falls": jnp.where(count > 0, steps.fell.sum() / count, jnp.nan),
-        "train/speed": steps.frame[..., features.velocity_index(robot)].mean(),
+        "train/speed": steps.frame[..., FrameLayout.of(robot).velocity.start].mean(),
         "train/reward": reward.mean(),
-        "train/reward_spread": high - low,
-        "train/reward_median": middle,
+        "train/reward_spread": spread,
+        "train/reward_median": median,
     }

@@ -224,8 +224,9 @@ def test_amp_loss_by_hand():
     penalty 0.01 * 4 = 0.04. Sum 41.760095.
     """
     params = {"params": {"logit": {"kernel": jnp.array([[2.0]]), "bias": jnp.zeros(1)}}}
-    network = adversary.Network((), 1.0, 1.0)
-    total, stats = adversary.cross_entropy(network.apply, params, jnp.array([[0.5]]), jnp.array([[-1.0]]), AMPConfig())
+    network = adversary.network((), 1.0, 1.0)
+    apply = lambda params, x: network.apply(params, x)[..., 0]  # noqa: E731
+    total, stats = adversary.cross_entropy(apply, params, jnp.array([[0.5]]), jnp.array([[-1.0]]), AMPConfig())
     assert float(total) == pytest.approx(41.760095, rel=1e-6)
     assert float(stats["discriminator_loss"]) == pytest.approx(1.720095, rel=1e-6)
     assert float(stats["gradient_penalty"]) == pytest.approx(4.0)

@@ -103,7 +103,8 @@ def test_onnxruntime_says_what_the_networks_say(tmp_path, robot, walk):
     observations = np.random.default_rng(1).normal(0, 3, (20, made.size)).astype(np.float32)
     state, wanted = network(observations)
     actions = action_map(robot, walk, made.config.env.action)
-    taken = policy.of(SimpleNamespace(config=made.config, robot=robot, env=SimpleNamespace(actions=actions)), state)
+    trainer = SimpleNamespace(config=made.config, robot=robot, ppo=ppo, env=SimpleNamespace(actions=actions))
+    taken = policy.of(trainer, state)
     by_onnx, given = targets(deploy.write(tmp_path, taken, robot, made.origin)[0], observations)
     np.testing.assert_allclose(
         by_onnx, np.clip(actions.center + actions.scale * wanted, actions.low, actions.high), atol=1e-5

@@ -460,7 +460,7 @@ def test_actions_reach_the_physics_through_the_map():
 
     built = Env(ROBOT, CLIP, preset("smoke", **{"env.count": COUNT}), Records())
     action = jax.random.uniform(jax.random.PRNGKey(0), (COUNT, JOINTS), minval=-3, maxval=3)
-    sim, _, _ = built.advance(built.reset(jax.random.PRNGKey(1)).physics, action)
+    sim = built.advance(built.reset(jax.random.PRNGKey(1)).physics, action).physics
     np.testing.assert_array_equal(sim.qpos[:, 7:], environments.action_map(ROBOT, CLIP, "residual")(action))
 
 

@@ -12,6 +12,7 @@ import pytest
 from fmpjax import features
 from fmpjax.config import FeatureConfig
 from fmpjax.errors import UserError
+from fmpjax.frames import FORWARD, PLANAR, FrameLayout
 
 H, FRAME, FULL = 10, 239, 2390
 POSITION = np.arange(3)  # of a frame: root x, y, z
@@ -262,7 +263,7 @@ def test_heading_axes_ignore_which_way_the_window_goes(robot, walk):
     np.testing.assert_allclose(own(turned), own(plain), atol=2e-5)
     assert np.abs(world(turned) - world(plain)).max() > 0.05
     # What a heading does not touch is what it was; the newest frame looks along x.
-    start = features.velocity_index(robot)
+    start = FrameLayout.of(robot).velocity.start
     unturned = np.r_[2, 5, 8, 9:67, start + 2, start + 5, start + 6 : plain.shape[-1]]
     placed = features.turned_windows(features.relative_windows(turned), own.planar)
     np.testing.assert_array_equal(placed[..., unturned], turned[..., unturned])
@@ -271,11 +272,27 @@ def test_heading_axes_ignore_which_way_the_window_goes(robot, walk):
     np.testing.assert_allclose(placed[:, -1, start], np.linalg.norm(qvel[index[:, -1], :2], axis=-1), atol=0.1)
 
 
-def test_velocity_index_points_at_the_forward_velocity(robot, observed, reference):
-    frame = observed["compact"].frame
-    assert frame.shape[-1] == 117 and features.frame_size(robot) == FRAME
-    np.testing.assert_allclose(frame[..., features.velocity_index(robot)], reference["qvel"][..., 0], atol=1e-6)
-    np.testing.assert_allclose(frame[..., :3], reference["qpos"][..., :3], atol=1e-6)  # absolute in the history
+def test_layout_says_where_each_quantity_stands(robot, observed, reference):
+    frame, layout = observed["compact"].frame, FrameLayout.of(robot)
+    qpos, qvel = reference["qpos"], reference["qvel"]
+    assert frame.shape[-1] == layout.size == 117 and features.frame_size(robot) == FRAME
+    full = observed["window"].reshape(24, H, FRAME)
+    expected = {
+        "root": qpos[..., :3],  # absolute in the history
+        "rotation": full[..., 3:9],
+        "cosine": np.cos(qpos[..., 7:]),
+        "sine": np.sin(qpos[..., 7:]),
+        "key_points": full[..., KEY_POINTS],
+        "velocity": qvel[..., :3],
+        "angular_velocity": full[..., 207:210],
+        "joint_velocity": qvel[..., 6:],
+    }
+    assert tuple(expected) == FrameLayout._fields
+    for name, values in expected.items():
+        np.testing.assert_allclose(frame[..., getattr(layout, name)], values, atol=1e-5, err_msg=name)
+    # What every robot's frames have at the same place.
+    np.testing.assert_allclose(frame[..., PLANAR], qpos[..., :2], atol=1e-6)
+    np.testing.assert_array_equal(frame[..., FORWARD], frame[..., layout.rotation][..., :2])
 
 
 def test_float64_agrees_to_rounding(observe, reference):

@@ -54,6 +54,10 @@ with runs._held([folder]):
     assert printed.splitlines()[-3:] == ["3 3", "3 3 CPU cores [set(), set()]", "held"]
 
 
+def test_mjx_says_nothing_of_a_warp_that_is_not_installed():
+    assert run("import sys; sys.modules['warp'] = None; import fmpjax.physics.mjx") == ""
+
+
 def test_cores_are_those_that_the_process_may_use(monkeypatch):
     monkeypatch.setattr(os, "process_cpu_count", lambda: 5, raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {1, 2}, raising=False)

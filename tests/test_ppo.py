@@ -9,9 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import linen
 
-from fmpjax import ppo as ppo_module
 from fmpjax.config import PPOConfig
 from fmpjax.ppo import PPO, Batch, adapt_rate, generalized_advantage
 
@@ -460,24 +458,3 @@ def test_only_the_minibatch_with_nonsense_is_skipped():
     assert float(metrics["skipped"]) == PROBE.actor_epochs
     assert not same(new.actor, state.actor) and not same(new.critic, state.critic)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(new))
-
-
-def test_elu_is_flaxs_with_its_derivative():
-    x = jnp.concatenate([jnp.linspace(-30.0, 5.0, 701), jnp.array([0.0, -1e-6, 1e-6])])
-    np.testing.assert_allclose(ppo_module.elu(x), linen.elu(x), rtol=0, atol=1e-7)
-    ours, theirs = (jax.vmap(jax.grad(f))(x) for f in (ppo_module.elu, linen.elu))
-    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-7)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 500, 4096, 5000])
-def test_an_order_holds_every_row_once(count):
-    order = np.asarray(ppo_module.permutation(jax.random.PRNGKey(count), count))
-    np.testing.assert_array_equal(np.sort(order), np.arange(count))
-
-
-def test_every_row_stands_everywhere_equally_often():
-    """Chi-squared of rows over places in 20,000 orders of six: 25 degrees of freedom, 52.6 at one in a thousand."""
-    keys = jax.random.split(jax.random.PRNGKey(0), 20_000)
-    orders = np.asarray(jax.vmap(lambda key: ppo_module.permutation(key, 6))(keys))
-    counts = np.array([np.bincount(column, minlength=6) for column in orders.T])
-    assert ((counts - 20_000 / 6) ** 2 / (20_000 / 6)).sum() < 52.6

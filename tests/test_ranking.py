@@ -9,6 +9,7 @@ from fmpjax import config as configuration
 from fmpjax import features, motion, priors
 from fmpjax.errors import UserError
 from fmpjax.experiments import ranking
+from fmpjax.frames import FrameLayout
 from fmpjax.train import Trainer
 
 
@@ -39,7 +40,7 @@ def test_copies_are_what_they_say(trainer):
     frames = copies["frozen"].reshape(len(copies["frozen"]), trainer.env.horizon, -1)
     undone = frames / np.asarray(trainer.feature_map.weight) * np.asarray(trainer.feature_map.deviation)
     speed = undone + np.asarray(trainer.feature_map.mean)
-    index = features.velocity_index(trainer.robot)
+    index = FrameLayout.of(trainer.robot).velocity.start
     unclipped = np.abs(frames / np.asarray(trainer.feature_map.weight))[..., index] < float(trainer.feature_map.clip)
     assert unclipped.any() and np.allclose(speed[..., index][unclipped], 0, atol=1e-4)
 

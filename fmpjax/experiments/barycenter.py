@@ -14,11 +14,12 @@ import jax
 import numpy as np
 
 from fmpjax import config as configuration
-from fmpjax import features, priors
+from fmpjax import priors
 from fmpjax.errors import UserError
 from fmpjax.experiments import results
 from fmpjax.experiments.results import Table, Verdict, number
 from fmpjax.features import FeatureMap
+from fmpjax.frames import PLANAR, FrameLayout
 from fmpjax.priors.barycentric import BarycentricState
 from fmpjax.shell import default
 from fmpjax.train import Trainer
@@ -116,7 +117,7 @@ def _figures(
     x = np.asarray(windows, np.float64).reshape(-1, windows.shape[-1])[chosen]
     frames = x.reshape(targets, env.horizon, -1)
     # Matched on all frames but the newest, less their planar positions: `barycentric.split`.
-    condition, successor = frames[:, :-1, 2:].reshape(targets, -1), frames[:, -1]
+    condition, successor = frames[:, :-1, PLANAR.stop :].reshape(targets, -1), frames[:, -1]
     atoms, after, dual = (np.asarray(a, np.float64) for a in (prior.condition, prior.successor, prior.dual))
     cost = 0.5 * ((condition**2).sum(-1)[:, None] + (atoms**2).sum(-1)) - condition @ atoms.T
     logits = (dual - cost) / float(prior.epsilon)
@@ -130,9 +131,9 @@ def _figures(
     native = np.asarray(reward, np.float64).ravel()[chosen]
     seen = native > np.finfo(np.float32).tiny
 
-    legs = -trainer.robot.joint_count + trainer.robot.sagittal_joints
+    layout = FrameLayout.of(trainer.robot)
+    legs, forward = layout.joint_velocity.start + trainer.robot.sagittal_joints, layout.velocity.start
     bank, goal = in_units(trainer.feature_map, after), in_units(trainer.feature_map, target)
-    forward = features.velocity_index(trainer.robot)
     kept, matched = retention(probability, bank[:, legs])
     effective = 1.0 / (probability**2).sum(-1)
     return {

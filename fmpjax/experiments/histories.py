@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import features
 from fmpjax.env import EnvState
 from fmpjax.errors import UserError
 from fmpjax.features import FeatureMap
+from fmpjax.frames import FrameLayout
 from fmpjax.ppo import PPOState
 from fmpjax.train import Trainer, TrainState
 
@@ -61,7 +61,7 @@ def pool(
     for chunk_key in jax.random.split(key, max(1, steps // last)):
         before = state
         state, record = play(state, chunk_key)
-    speed = float(record.frame[..., features.velocity_index(trainer.robot)].mean())
+    speed = float(record.frame[..., FrameLayout.of(trainer.robot).velocity.start].mean())
     return Pool(feature_map(trainer.env.frame_table(before, record)[record.window]), ~record.nonfinite, speed)
 
 
@@ -108,5 +108,5 @@ def soon_after_reset(
             "stays up"
         )
     frames = trainer.env.frame_table(before, record)[record.window[age[kept] - 1, kept]]
-    speed = float(frames[..., features.velocity_index(trainer.robot)].mean())
+    speed = float(frames[..., FrameLayout.of(trainer.robot).velocity.start].mean())
     return Cohort(feature_map(frames), speed)

@@ -22,6 +22,7 @@ from fmpjax import features, jsons, physics, potential, ppo, priors, runs
 from fmpjax.config import Config, preset
 from fmpjax.evaluate import Evaluator
 from fmpjax.experiments import reference, results
+from fmpjax.frames import FrameLayout
 from fmpjax.priors import flow
 from fmpjax.priors.base import couple, median_reward
 from fmpjax.robots import Robot
@@ -61,7 +62,7 @@ class Moments(NamedTuple):
 def gather(trainer: Trainer, state: TrainState, key: jax.Array) -> Moments:
     """Play the policy of ``state`` on, and score what it does with the prior of ``state``."""
     env, steps = trainer.env, trainer.config.ppo.rollout_steps
-    forward = features.velocity_index(trainer.robot)
+    forward = FrameLayout.of(trainer.robot).velocity.start
     lag = jnp.arange(1 - env.horizon, 1)[:, None] / trainer.config.control_rate  # s before the newest frame
 
     def play(env_state, key):
@@ -168,12 +169,13 @@ def gradients(trainer: Trainer, state: TrainState, moments: Moments) -> dict[str
     }
 
 
-def _groups(robot: Robot) -> dict[str, int]:
-    """Sizes of the quantities in a compact frame, in their order."""
-    joints = robot.joint_count
+def _groups(robot: Robot) -> dict[str, slice]:
+    """Where the quantities stand in a compact frame."""
+    at = FrameLayout.of(robot)
     return {
-        "root_position": 3, "root_rotation": 6, "joint_angles": 2 * joints, "key_points": 3 * len(robot.key_body),
-        "root_velocity": 3, "root_angular_velocity": 3, "joint_velocity": joints,
+        "root_position": at.root, "root_rotation": at.rotation, "joint_angles": slice(at.cosine.start, at.sine.stop),
+        "key_points": at.key_points, "root_velocity": at.velocity, "root_angular_velocity": at.angular_velocity,
+        "joint_velocity": at.joint_velocity,
     }  # fmt: skip
 
 
@@ -211,10 +213,8 @@ def fits(trainer: Trainer, state: TrainState, moments: Moments, key: jax.Array) 
     row["standing_push_gain"] = jnp.where(standing, gain, 0.0).sum() / jnp.maximum(standing.sum(), 1) / spread
     weight = truth.gradient**2
     frame = weight.reshape(len(query), trainer.env.horizon, -1)
-    start = 0
-    for name, size in _groups(trainer.robot).items():
-        row[f"gradient_share_{name}"] = frame[..., start : start + size].sum() / weight.sum()
-        start += size
+    for name, place in _groups(trainer.robot).items():
+        row[f"gradient_share_{name}"] = frame[..., place].sum() / weight.sum()
     floored = trainer.feature_map.deviation > deviations(trainer) * (1 + 1e-5)
     row["floored_coordinates"] = floored.mean()
     row["gradient_share_floored"] = (frame * floored).sum() / weight.sum()
@@ -297,7 +297,7 @@ def track(trainer: Trainer) -> dict[str, float]:
     def play(carried):
         def step(sim, inputs):
             action, q, v = inputs
-            sim, _, fell = env.advance(sim, action[None].astype(jnp.float32))
+            sim, _, fell, _ = env.advance(sim, action[None].astype(jnp.float32))
             error = sim.qpos[0, 7:] - q[7:]
             if carried:
                 sim = sim._replace(qpos=sim.qpos.at[0, :7].set(q[:7]), qvel=sim.qvel.at[0, :6].set(v[:6]))

@@ -1,11 +1,15 @@
 """MJX: the physics on the device, for accelerators."""
 
+import contextlib
+import io
 from typing import NoReturn
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX prints where Warp, which is optional, is not installed
+    from mujoco import mjx
 
 from fmpjax.config import PhysicsConfig
 from fmpjax.errors import UserError

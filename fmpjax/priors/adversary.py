@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import optax
 from flax import linen
 
-from fmpjax import sharding
+from fmpjax import learning, sharding
 from fmpjax.config import AdversaryConfig
-from fmpjax.priors.base import Expert, Metrics, MotionPrior, Rollout, flatten, step_if_finite
+from fmpjax.priors.base import Expert, Metrics, MotionPrior, Rollout, flatten
 
 
 class Normalizer(NamedTuple):
@@ -43,27 +43,24 @@ class State(NamedTuple):
     replay: Replay | None  # None where the settings ask for no replay: a checkpoint holds no empty array
 
 
-class Network(linen.Module):
-    """One number ``[n]`` per normalized window ``[n, D]``; larger means more like the demonstration.
+def network(hidden: tuple[int, ...], logit_init: float, dimension: float) -> learning.MLP:
+    """One number ``[n, 1]`` per normalized window ``[n, D]``; larger means more like the demonstration.
 
     Weights start uniform within 1 / sqrt(inputs), of the first layer those of the full window.
+
+    Args:
+      hidden: widths of the hidden layers.
+      logit_init: bound of the last layer's weights.
+      dimension: d, coordinates of the full window.
     """
-
-    hidden: tuple[int, ...]
-    logit_init: float
-    dimension: float  # d, coordinates of the full window
-
-    @linen.compact
-    def __call__(self, x):
-        inputs = self.dimension
-        for width in self.hidden:
-            x = linen.relu(linen.Dense(width, kernel_init=_uniform(1 / math.sqrt(inputs)))(x))
-            inputs = width
-        return linen.Dense(1, kernel_init=_uniform(self.logit_init), name="logit")(x)[..., 0]
-
-
-def _uniform(bound: float):
-    return lambda key, shape, dtype=jnp.float32: jax.random.uniform(key, shape, dtype, -bound, bound)
+    bounds = [1 / math.sqrt(inputs) for inputs in (dimension, *hidden)]
+    bounds[-1] = logit_init
+    return learning.MLP(
+        widths=(*hidden, 1),
+        kernel_inits=[learning.uniform(bound) for bound in bounds],
+        activation=linen.relu,
+        names=(*(f"Dense_{i}" for i in range(len(hidden))), "logit"),
+    )
 
 
 def update_normalizer(state: Normalizer, agent: jax.Array, demonstration: jax.Array) -> Normalizer:
@@ -136,14 +133,11 @@ class Adversary(NamedTuple):
 
 def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
     """The network that minimizes ``loss`` between the windows of the demonstration and the policy's."""
-    network = Network(settings.hidden, settings.logit_init, expert.dimension)
-    size = expert.windows.shape[-1]
-    if settings.optimizer == "adam":
-        direction = optax.scale_by_adam()
-    else:
-        direction = optax.trace(settings.momentum)
+    net, size = network(settings.hidden, settings.logit_init, expert.dimension), expert.windows.shape[-1]
     optimizer = optax.chain(
-        optax.add_decayed_weights(settings.weight_decay), direction, optax.scale(-settings.learning_rate)
+        optax.add_decayed_weights(settings.weight_decay),
+        learning.direction(settings.optimizer, settings.momentum),
+        optax.scale(-settings.learning_rate),
     )
     # A feature over its weight is a standardized coordinate. Coordinates that stand twice in the full window stand once
     # here, root two times as large, so that the gradient penalty is the full window's.
@@ -151,11 +145,14 @@ def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
 
     def normalize(normalizer: Normalizer, x):
         deviation = jnp.sqrt(jnp.maximum(normalizer.variance, settings.normalizer_floor**2))
-        z = (x / expert.weight - normalizer.mean) / deviation
-        return jnp.clip(z, -settings.normalizer_clip, settings.normalizer_clip) * multiplicity
+        z = learning.standardize(x / expert.weight, normalizer.mean, deviation, settings.normalizer_clip)
+        return z * multiplicity
+
+    def apply(params, x):
+        return net.apply(params, x)[..., 0]
 
     def init(key):
-        params = network.init(key, jnp.zeros((1, size)))
+        params = net.init(key, jnp.zeros((1, size)))
         normalizer = Normalizer(jnp.float32(0.0), jnp.zeros(size), jnp.ones(size))
         replay = None
         if settings.replay:
@@ -163,7 +160,7 @@ def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
         return State(params, optimizer.init(params), normalizer, replay)
 
     def score(state: State, x):
-        return network.apply(state.params, normalize(state.normalizer, x))
+        return apply(state.params, normalize(state.normalizer, x))
 
     def fit(state: State, pool, scores, key):
         order_key, seen_key, replay_key, store_key = jax.random.split(key, 4)
@@ -180,10 +177,10 @@ def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
             agent = normalize(state.normalizer, agent)
             demonstration = normalize(state.normalizer, expert.draw(expert_key, rows.shape))
             (total, stats), gradients = jax.value_and_grad(
-                lambda p: loss(network.apply, p, agent, demonstration, jax.random.fold_in(key, 1)), has_aux=True
+                lambda p: loss(apply, p, agent, demonstration, jax.random.fold_in(key, 1)), has_aux=True
             )(params)
-            params, optimizer_state, finite = step_if_finite(optimizer, params, optimizer_state, total, gradients)
-            return (params, optimizer_state), stats | {"skipped": (~finite).astype(jnp.float32)}
+            taken = learning.step_if_finite(optimizer, params, optimizer_state, total, gradients)
+            return (taken.params, taken.optimizer), stats | {"skipped": taken.skipped}
 
         # Passes over the rollout in random order, as many as the updates need.
         needed = settings.updates * settings.minibatch
@@ -196,14 +193,8 @@ def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
         # What scored and was fitted saw one normalizer; the next rollout is scored with the next.
         seen = expert.draw(seen_key, (len(pool),))
         normalizer = update_normalizer(state.normalizer, pool / expert.weight, seen / expert.weight)
-        low, middle, high = jnp.quantile(scores, jnp.array([0.25, 0.5, 0.75]))
-        summary = {name: values.mean() for name, values in stats.items()}
-        summary |= {
-            "skipped": stats["skipped"].sum(),
-            "score_median": middle,
-            "score_spread": high - low,
-            "expert_margin": (score(state, expert.windows).mean() - middle) / jnp.maximum(high - low, 1e-6),
-        }
+        summary = {name: values.mean() for name, values in stats.items()} | {"skipped": stats["skipped"].sum()}
+        summary |= learning.score_metrics(*learning.median_and_spread(scores), score(state, expert.windows))
         if settings.replay:
             summary["replayed"] = replay.count.astype(jnp.float32)
         return State(params, optimizer_state, normalizer, replay), summary

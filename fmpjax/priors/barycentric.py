@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from fmpjax import sharding, transport
+from fmpjax import learning, sharding, transport
 from fmpjax.config import Config, PriorConfig
+from fmpjax.frames import PLANAR
 from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten
 
 
@@ -25,17 +25,23 @@ class BarycentricState(NamedTuple):
 
 
 def split(windows: jax.Array, horizon: int) -> tuple[jax.Array, jax.Array]:
-    """What is matched ``[n, (H - 1)(F - 2)]`` and what is scored ``[n, F]`` of features ``[n, H F]``.
+    """What is matched, ``[n, (H - 1)(F - 2)]``, and what is scored, ``[n, F]``, of features ``[n, H F]``.
 
     The planar position of the preceding frames is left out: it is relative to the newest frame, and would tell where
     that frame is.
     """
     frames = windows.reshape(len(windows), horizon, -1)
-    return frames[:, :-1, 2:].reshape(len(windows), -1), frames[:, -1]
+    return frames[:, :-1, PLANAR.stop :].reshape(len(windows), -1), frames[:, -1]
 
 
-def match(source: jax.Array, condition: jax.Array, expert: Expert, config: PriorConfig):
-    """Dual ``[m]`` of an expert bank's conditions against a source bank's, and the entropy coefficient."""
+def match(
+    source: jax.Array, condition: jax.Array, expert: Expert, config: PriorConfig
+) -> tuple[jax.Array, jax.Array, transport.Solve]:
+    """Transport of a source bank's conditions ``[n, C]`` to those of an expert bank, ``[m, C]``.
+
+    Returns:
+      The expert bank's dual ``[m]``, the entropy coefficient, and the whole solution, which tells of its convergence.
+    """
     cost = transport.squared_cost(source, condition)
 
     def solve(cost):
@@ -91,10 +97,8 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         reward = 2.0 * jnp.exp(scores).reshape(rollout.valid.shape)
         reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
         _, probability = target(state, split(source, expert.horizon)[0])
-        low, middle, high = jnp.quantile(scores, np.array([0.25, 0.5, 0.75]))
         summary = {
-            "score_median": middle,
-            "score_spread": high - low,
+            **learning.score_metrics(*learning.median_and_spread(scores)),
             "effective_atoms": (1.0 / jnp.sum(probability**2, axis=-1)).mean(),
             "epsilon": epsilon,
             "sinkhorn_iterations": solution.iterations[0].astype(jnp.float32),

@@ -5,9 +5,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 
-from fmpjax import sharding, transport
+from fmpjax import learning, sharding, transport
 from fmpjax.config import PriorConfig
 
 PriorState = Any
@@ -32,9 +31,10 @@ class Expert(NamedTuple):
     share: jax.Array | None = None  # [W] how often each window is drawn, summing to one; evenly where None
 
     def bank_rows(self, key: jax.Array, size: int) -> jax.Array:
-        """Windows ``[size]`` of an expert bank: spread evenly over the demonstrations, repeated where they are shorter.
+        """Rows of `windows` that make an expert bank, ``[size]`` int32.
 
-        An even spread is a stratified draw: it has the uniform draw's mean and less variance.
+        They are spread evenly over the demonstrations, and repeat where there are fewer windows than ``size``. An even
+        spread is a stratified draw: it has the uniform draw's mean and less variance.
         """
         offset, count = jax.random.uniform(key), len(self.windows)
         if self.share is None:
@@ -65,14 +65,6 @@ def flatten(rollout: Rollout, stand_in: jax.Array) -> jax.Array:
     """All windows of a rollout, ``[T * N, D]``; ``stand_in [D]`` takes the place of those that are not finite."""
     features = jnp.where(rollout.valid[..., None], rollout.features, stand_in)
     return sharding.split(features.reshape(-1, features.shape[-1]))
-
-
-def step_if_finite(optimizer: optax.GradientTransformation, params, state: optax.OptState, loss, gradients):
-    """Parameters and optimizer state after a step, and whether it was taken: not where a number is not finite."""
-    updates, new_state = optimizer.update(gradients, state, params)
-    finite = jnp.isfinite(loss) & jnp.isfinite(optax.global_norm(gradients))
-    new = (optax.apply_updates(params, updates), new_state)
-    return *jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, (params, state)), finite
 
 
 class Coupling(NamedTuple):
@@ -118,6 +110,6 @@ class Reward(NamedTuple):
 
 def median_reward(score: jax.Array, valid: jax.Array, spread_floor: float) -> Reward:
     """Reward 2 sigmoid((S - median) / max(IQR, floor)) over the rollout's valid windows (eq. reward), 0 elsewhere."""
-    low, middle, high = jnp.nanquantile(jnp.where(valid, score, jnp.nan), jnp.array([0.25, 0.5, 0.75]))
-    reward = 2.0 * jax.nn.sigmoid((score - middle) / jnp.maximum(high - low, spread_floor))
-    return Reward(jnp.where(valid & jnp.isfinite(reward), reward, 0.0), middle, high - low)
+    median, spread = learning.median_and_spread(jnp.where(valid, score, jnp.nan), jnp.nanquantile)
+    reward = 2.0 * jax.nn.sigmoid((score - median) / jnp.maximum(spread, spread_floor))
+    return Reward(jnp.where(valid & jnp.isfinite(reward), reward, 0.0), median, spread)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from fmpjax import transport
+from fmpjax import learning, transport
 from fmpjax.config import Config
 from fmpjax.priors.base import Expert, MotionPrior, Rollout, couple_draws, flatten, median_reward
 
@@ -62,10 +62,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         scores = score(state, pool).reshape(rollout.valid.shape)
         result = median_reward(scores, rollout.valid, settings.spread_floor)
         summary = {
-            "score_median": result.median,
-            "score_spread": result.spread,
-            "expert_margin": (score(state, bank).mean() - result.median)
-            / jnp.maximum(result.spread, settings.spread_floor),
+            **learning.score_metrics(result.median, result.spread, score(state, bank), settings.spread_floor),
             "epsilon": solutions.epsilon.mean(),
             "sinkhorn_iterations": solutions.iterations.max(-1).mean(),
             "unconverged": (~solutions.converged).sum().astype(jnp.float32),

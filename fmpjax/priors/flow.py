@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from fmpjax import potential, sharding, transport
+from fmpjax import learning, potential, sharding, transport
 from fmpjax.config import Config, PriorConfig
 from fmpjax.priors.base import (
     Coupling,
@@ -22,7 +22,6 @@ from fmpjax.priors.base import (
     couple_draws,
     flatten,
     median_reward,
-    step_if_finite,
 )
 
 
@@ -166,8 +165,7 @@ def make_static(expert: Expert, config: Config) -> MotionPrior:
 def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> MotionPrior:
     windows, dimension = expert.windows, expert.dimension
     optimizer = optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.adam(config.learning_rate))
-    # Weight of the newest parameters such that an update's share halves after `average_half_life` updates.
-    newest = 1.0 - 0.5 ** (1.0 / config.average_half_life)
+    newest = learning.newest_share(config.average_half_life)  # half-life in updates
 
     def init(key):
         bank_key, key = jax.random.split(key)
@@ -177,15 +175,15 @@ def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> Motio
     def score(state: FlowState, x):
         return potential.score(state.average, x, dimension)
 
-    def fit_once(carry, update, expert_bank, pool, count):
+    def fit_once(carry, drawn, expert_bank, pool, count):
         params, optimizer_state, average = carry
-        coupling, second, query_key, flow_key = update
+        coupling, second, query_key, flow_key = drawn
         if config.query_is_bank:
             query, teacher = sharding.split(coupling.source), teach(coupling, expert_bank, None)
         else:
             querying = max(1, int(config.query_share * count))  # the first environments supply the queries
-            pick = jax.random.randint(query_key, (config.minibatch,), 0, len(pool) // count * querying)
-            query = sharding.split(pool[pick // querying * count + pick % querying])
+            row = jax.random.randint(query_key, (config.minibatch,), 0, len(pool) // count * querying)
+            query = sharding.split(pool[row // querying * count + row % querying])
             teacher = teach(coupling, expert_bank, query)
         flow = sample_flow(flow_key, query, teacher, coupling.source, expert_bank)
         if static:
@@ -193,21 +191,20 @@ def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> Motio
         (total, stats), gradients = jax.value_and_grad(losses, has_aux=True)(
             params, query, teacher, flow, dimension, config
         )
-        params, optimizer_state, finite = step_if_finite(optimizer, params, optimizer_state, total, gradients)
-        average = jax.tree.map(lambda a, p: a + newest * (p - a), average, params)
+        step = learning.step_if_finite(optimizer, params, optimizer_state, total, gradients)
         metrics = stats | {
-            "gradient_norm": optax.global_norm(gradients),
+            "gradient_norm": step.gradient_norm,
             "epsilon": teacher.solution.epsilon,
             "sinkhorn_iterations": teacher.solution.iterations.max(),
             "unconverged": (~teacher.solution.converged).sum().astype(jnp.float32),
-            "skipped": (~finite).astype(jnp.float32),
+            "skipped": step.skipped,
         }
-        return (params, optimizer_state, average), metrics
+        return (step.params, step.optimizer, learning.toward(average, step.params, newest)), metrics
 
     def update(state: FlowState, rollout: Rollout, key):
-        # A window that is not finite is replaced by the first expert window: it neither spreads nor is rewarded.
-        expert_bank = windows[state.bank]
-        pool, shape = flatten(rollout, windows[0]), rollout.valid.shape
+        expert_bank, shape = windows[state.bank], rollout.valid.shape
+        # A window that is not finite is replaced by the first of the demonstration, and is not rewarded.
+        pool = flatten(rollout, windows[0])
         bank_keys, query_keys, flow_keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(
             jax.random.split(key, config.updates)
         )
@@ -217,7 +214,7 @@ def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> Motio
             second_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(bank_keys)
             second = couple_draws(second_keys, pool, expert_bank, dimension, config)
         carry, metrics = jax.lax.scan(
-            lambda carry, update: fit_once(carry, update, expert_bank, pool, shape[1]),
+            lambda carry, drawn: fit_once(carry, drawn, expert_bank, pool, shape[1]),
             (state.params, state.optimizer, state.params if config.average_restarts else state.average),
             (first, second, query_keys, flow_keys),
         )
@@ -226,13 +223,7 @@ def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> Motio
         summary = {name: values.mean() for name, values in metrics.items()}
         for name in ("unconverged", "skipped"):
             summary[name] = metrics[name].sum()
-        summary |= {
-            "score_median": result.median,
-            "score_spread": result.spread,
-            # Where the demonstration stands in the reward's own units.
-            "expert_margin": (score(state, expert_bank).mean() - result.median)
-            / jnp.maximum(result.spread, config.spread_floor),
-        }
+        summary |= learning.score_metrics(result.median, result.spread, score(state, expert_bank), config.spread_floor)
         return state, result.reward, summary
 
     return MotionPrior(init, update, score)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from fmpjax import sharding, transport
+from fmpjax import learning, sharding, transport
 from fmpjax.config import Config
 from fmpjax.priors.base import Expert, MotionPrior, Rollout
 
@@ -94,10 +94,8 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         reward = settings.scale * jnp.exp(scores)
         # A step that finds too little mass earns nothing: what it moved does not tell how far off it is.
         reward = jnp.where(rollout.valid & (left == 0) & jnp.isfinite(reward), reward, 0.0)
-        low, middle, high = jnp.quantile(scores, jnp.array([0.25, 0.5, 0.75]))
         summary = {
-            "score_median": middle,
-            "score_spread": high - low,
+            **learning.score_metrics(*learning.median_and_spread(scores)),
             "coupling_distance": cost.mean() / step_mass,
             "mass_held": held.mean(),
         }

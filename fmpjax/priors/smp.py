@@ -17,9 +17,9 @@ import numpy as np
 import optax
 from flax import linen
 
-from fmpjax import sharding
+from fmpjax import learning, sharding
 from fmpjax.config import SMP_NETWORKS, Config
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten, step_if_finite
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten
 
 
 class SMPState(NamedTuple):
@@ -118,15 +118,18 @@ def make(expert: Expert, config: Config) -> MotionPrior:
                 return jnp.abs(network.apply(params, noised(x, noise, left[at][:, None]), at) - noise).mean()
 
             value, gradients = jax.value_and_grad(loss)(state.params)
-            params, opt, finite = step_if_finite(optimizer, state.params, state.optimizer, value, gradients)
+            taken = learning.step_if_finite(optimizer, state.params, state.optimizer, value, gradients)
             newest = 1.0 - settings.average
-            average = jax.tree.map(lambda a, p: a + newest * (p - a), state.average, params)
             share = jnp.maximum(1.0 / (state.iteration + 1), newest)
-            running = jnp.where(finite, state.loss + share * (value - state.loss), state.loss)
+            running = jnp.where(taken.finite, learning.toward(state.loss, value, share), state.loss)
             state = state._replace(
-                params=params, average=average, optimizer=opt, iteration=state.iteration + 1, loss=running
+                params=taken.params,
+                average=learning.toward(state.average, taken.params, newest),
+                optimizer=taken.optimizer,
+                iteration=state.iteration + 1,
+                loss=running,
             )
-            return state, skipped + ~finite
+            return state, skipped + ~taken.finite
 
         # A loop that may make no round, not a branch: over several seeds at once a branch would take both ways.
         return jax.lax.while_loop(lambda carry: carry[0].iteration < settings.iterations, step, (state, jnp.int32(0)))
@@ -161,20 +164,17 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         error, demonstration = both[:, : len(pool)], both[:, len(pool) :]
         share = jnp.where(state.seen < settings.mean_samples, len(pool) / (state.seen + len(pool)), 0.0)
         state = state._replace(
-            error=state.error + share * (error.mean(1) - state.error),
+            error=learning.toward(state.error, error.mean(1), share),
             seen=jnp.where(share > 0, state.seen + len(pool), state.seen),
         )
         scores = exponent(state, error)
         reward = settings.scale * jnp.exp(scores).reshape(rollout.valid.shape)
         reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
-        low, middle, high = jnp.quantile(scores, jnp.array([0.25, 0.5, 0.75]))
         summary = {
+            **learning.score_metrics(*learning.median_and_spread(scores), exponent(state, demonstration)),
             "pretraining_loss": state.loss,
             "denoising_error": error.mean(),
             "expert_error": demonstration.mean(),
-            "score_median": middle,
-            "score_spread": high - low,
-            "expert_margin": (exponent(state, demonstration).mean() - middle) / jnp.maximum(high - low, 1e-6),
             "skipped": skipped.astype(jnp.float32),
         }
         return state, reward, summary

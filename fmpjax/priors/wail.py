@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from fmpjax import learning
 from fmpjax.config import Config, WAILConfig
 from fmpjax.priors import adversary
 from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten
@@ -46,7 +47,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
     """Wasserstein Adversarial Imitation Learning: a critic of slope one, whose values are standardized."""
     settings = config.wail
     critic = adversary.make(expert, settings, lambda *arguments: loss(*arguments, settings))
-    newest = 1.0 - 0.5 ** (1.0 / settings.deviation_half_life)
+    newest = learning.newest_share(settings.deviation_half_life)
 
     def init(key):
         return WAILState(critic.init(key), jnp.float32(0.0), jnp.int32(0))
@@ -61,7 +62,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         fresh = jnp.where(known, (grid - mean) ** 2, 0.0).sum() / count
         # A plain mean until the running one has as many rollouts as it remembers.
         share = jnp.maximum(newest, 1.0 / (state.rollouts + 1))
-        variance = state.variance + share * (fresh - state.variance)
+        variance = learning.toward(state.variance, fresh, share)
         deviation = jnp.maximum(jnp.sqrt(variance), settings.deviation_floor)
         reward = jnp.where(known, 2.0 * jax.nn.sigmoid((grid - mean) / deviation), 0.0)
         fitted, summary = critic.fit(state.critic, pool, values, key)

@@ -1,0 +1,48 @@
+"""Where each quantity stands in a compact frame. This order is written here and nowhere else."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fmpjax.robots import Robot
+
+
+class FrameLayout(NamedTuple):
+    """Slices of the last axis of compact frames ``[..., F]``, in their order."""
+
+    root: slice  # m, absolute; in a relative window x and y are relative to the newest frame
+    rotation: slice  # 6D rotation of the root
+    cosine: slice  # of the joint angles
+    sine: slice
+    key_points: slice  # m, x, y and z of each key point less the root
+    velocity: slice  # m/s, of the root in world axes
+    angular_velocity: slice  # rad/s, of the root in world axes
+    joint_velocity: slice  # rad/s
+
+    @classmethod
+    def of(cls, robot: Robot) -> "FrameLayout":
+        """The layout of a robot's frames."""
+        joints = robot.joint_count
+        return cls(*_slices(3, 6, joints, joints, 3 * len(robot.key_body), 3, 3, joints))
+
+    @property
+    def size(self) -> int:
+        """F, numbers in a frame."""
+        return self[-1].stop
+
+    @classmethod
+    def join(cls, **parts: jax.Array) -> jax.Array:
+        """Frames ``[..., F]`` of their parts, each given by its field's name."""
+        return jnp.concatenate([parts[name] for name in cls._fields], axis=-1)
+
+
+def _slices(*widths: int) -> list[slice]:
+    ends = np.cumsum(widths).tolist()
+    return [slice(end - width, end) for end, width in zip(ends, widths, strict=True)]
+
+
+# The same in every robot's frames.
+PLANAR = slice(0, 2)  # x and y of the root
+FORWARD = slice(3, 5)  # x and y of the root's x axis, the way that it faces
