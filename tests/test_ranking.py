@@ -9,7 +9,7 @@ from fmpjax import config as configuration
 from fmpjax import features, motion, priors
 from fmpjax.errors import UserError
 from fmpjax.experiments import ranking
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 
 @pytest.fixture(scope="module")

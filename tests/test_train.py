@@ -28,7 +28,7 @@ from fmpjax.errors import UserError
 from fmpjax.evaluate import Episodes, Evaluation, Evaluator
 from fmpjax.logs import MetricsLog
 from fmpjax.priors import Expert
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 # Eight environments, eight steps, five chunks of two iterations: a second of training after the compilation.
 TINY = {

@@ -14,7 +14,7 @@ from fmpjax.evaluate import Evaluation, Evaluator
 from fmpjax.files import write
 from fmpjax.motion import check
 from fmpjax.provenance import provenance
-from fmpjax.train import Trainer, TrainState
+from fmpjax.trainer import Trainer, TrainState
 
 
 def load_motion(config: Config) -> motion.MotionLibrary:

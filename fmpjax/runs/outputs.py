@@ -13,7 +13,7 @@ from fmpjax.evaluate import Episodes, table
 from fmpjax.files import without_places, write
 from fmpjax.logs import MetricsLog
 from fmpjax.runs.folder import Run
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 from fmpjax.viz import curves, render
 
 _EXPORTED = (

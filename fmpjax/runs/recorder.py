@@ -10,7 +10,7 @@ from fmpjax.logs import MetricsLog, clock
 from fmpjax.ppo import PPOState
 from fmpjax.runs.clock import Clock
 from fmpjax.runs.folder import Run
-from fmpjax.train import TrainState
+from fmpjax.trainer import TrainState
 
 
 class Recorder:

@@ -11,7 +11,7 @@ from fmpjax import sharding
 from fmpjax.config import Config
 from fmpjax.errors import UserError
 from fmpjax.runs.folder import Run
-from fmpjax.train import Trainer, TrainState, stack, unstack
+from fmpjax.trainer import Trainer, TrainState, stack, unstack
 
 
 class Session:
