@@ -183,6 +183,7 @@ def evaluation(falls):
     """Figures of ten episodes at the demonstration's own speed, of which some fell: the quality is 1 - falls / 10."""
     names = [f.name for f in dataclasses.fields(Evaluation) if f.name not in ("starts", "motions")]
     known = {"episodes": 10, "falls": falls, "late_speed": 0.8, "demonstration_speed": 0.8}
+    known |= {"joint_ranges": (0.0,) * 6, "expert_ranges": (0.0,) * 6}
     return Evaluation(**dict.fromkeys(names, 0.0) | known)
 
 

@@ -3,13 +3,16 @@
 from fmpjax.files import without_places, write
 from fmpjax.provenance import machine, provenance
 from fmpjax.runs.clock import End
-from fmpjax.runs.folder import Run, describe, load_motion
+from fmpjax.runs.folder import Run, check_trainable, default_folder, default_preset, describe, load_motion
 from fmpjax.runs.outputs import export, finish, video
 from fmpjax.runs.training import train
 
 __all__ = [
     "End",
     "Run",
+    "check_trainable",
+    "default_folder",
+    "default_preset",
     "describe",
     "export",
     "finish",

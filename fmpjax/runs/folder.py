@@ -2,11 +2,14 @@
 
 import dataclasses
 import json
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from fmpjax import config as configuration
-from fmpjax import jsons, motion, robots
+from fmpjax import jsons, memory, motion, priors, robots
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import Config
 from fmpjax.errors import UserError
@@ -15,6 +18,27 @@ from fmpjax.files import write
 from fmpjax.motion import check
 from fmpjax.provenance import provenance
 from fmpjax.trainer import Trainer, TrainState
+
+
+def default_preset() -> str:
+    """Name of the preset for the device that JAX computes on."""
+    return "laptop" if jax.default_backend() == "cpu" else "paper"
+
+
+def default_folder(config: Config) -> Path:
+    """A new run's folder where none is named, by its method and the time."""
+    return Path("runs") / f"{config.method}-{datetime.now().strftime('%Y%m%d-%H%M%S')}"
+
+
+def check_trainable(config: Config, seeds: int = 1) -> None:
+    """Ask before there is a folder, which the corrected call would find taken, whether runs can be trained here.
+
+    Raises:
+      UserError: the method or the robot is unknown, or ``seeds`` runs at once do not fit the memory.
+    """
+    priors.check(config.method)
+    robots.load(config.robot)
+    memory.check(config, seeds)
 
 
 def load_motion(config: Config) -> motion.MotionLibrary:
