@@ -21,7 +21,7 @@ from fmpjax import config, motion, priors, transport
 from fmpjax.config import PriorConfig
 from fmpjax.experiments.offline import product_flops, product_rate
 from fmpjax.priors import flow
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 TARGET = 50.0  # ms an update
 REPORTED_UPDATES = 9216  # of the paper's offline comparison

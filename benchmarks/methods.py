@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from fmpjax import config, motion, priors
-from fmpjax.train import Trainer, _batch
+from fmpjax.trainer import Trainer, _batch
 
 
 def seconds(call: Callable[[], object]) -> float:

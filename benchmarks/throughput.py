@@ -216,7 +216,7 @@ def parts(trainer, state, seeds: int) -> dict[str, Part]:
     import jax
 
     from fmpjax import priors
-    from fmpjax.train import _batch
+    from fmpjax.trainer import _batch
 
     env, ppo, prior = trainer.env, trainer.ppo, trainer.prior
     over = jax.vmap if seeds > 1 else lambda function: function
@@ -264,7 +264,7 @@ def prepare(arguments, clip, environments: int, seeds: int, devices: int) -> Cas
     import jax.numpy as jnp
 
     from fmpjax import sharding
-    from fmpjax.train import Trainer, stack
+    from fmpjax.trainer import Trainer, stack
 
     trainer = Trainer(settings_of(arguments, environments, seeds), clip)
     settings = trainer.config

@@ -12,7 +12,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from fmpjax.errors import UserError
-from fmpjax.train import TrainState
+from fmpjax.trainer import TrainState
 
 KEEP = 3  # last checkpoints kept
 

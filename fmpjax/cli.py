@@ -5,7 +5,6 @@ import math
 import os
 import sys
 import time
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -164,18 +163,12 @@ class Train:
         runs = _runs()
         from fmpjax import sharding
 
-        config = configuration.preset(self.preset or _default_preset(), **self._changes())
-        from fmpjax import memory, priors, robots
-
-        priors.check(config.method)
-        robots.load(config.robot)
-        # Before there is a folder, which the corrected command would find taken.
-        memory.check(config, self.seeds or 1)
+        config = configuration.preset(self.preset or runs.default_preset(), **self._changes())
+        runs.check_trainable(config, self.seeds or 1)
         if devices != 1:
             sharding.check_divides(config.env.count, self.seeds or 1, sharding.mesh(devices).size)
         print(runs.describe(config), flush=True)
-        stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-        folder = self.run or Path("runs") / f"{config.method}-{stamp}"
+        folder = self.run or runs.default_folder(config)
         if self.seeds is None:
             return [runs.Run.create(folder, config)]
         seeds = range(config.seed, config.seed + self.seeds)
@@ -354,12 +347,6 @@ def _runs():
             f"JAX_PLATFORMS is {platforms!r}, and no such device is there: expected cpu, or a device that JAX sees"
         ) from None
     return runs
-
-
-def _default_preset() -> str:
-    import jax
-
-    return "laptop" if jax.default_backend() == "cpu" else "paper"
 
 
 COMMANDS = shell.Group(

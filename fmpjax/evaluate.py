@@ -16,7 +16,7 @@ from fmpjax.config import Config, FeatureConfig
 from fmpjax.env import EnvState
 from fmpjax.motion import MotionClip
 from fmpjax.ppo import PPOState
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 DETAILED = 64  # episodes whose late speed, joints and feet are analysed [P]
 WINDOWS = 512  # windows at most on either side of the Sinkhorn discrepancy [D]

@@ -9,7 +9,7 @@ from fmpjax.errors import UserError
 
 if TYPE_CHECKING:
     from fmpjax.ppo import PPOState
-    from fmpjax.train import Trainer
+    from fmpjax.trainer import Trainer
 
 _ACTIVATIONS = {
     "relu": lambda x: np.maximum(x, 0.0),

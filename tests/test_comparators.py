@@ -12,7 +12,7 @@ from fmpjax import priors, transport
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import AMPConfig, Config, EnvConfig, GAILConfig, PriorConfig, SMPConfig, WAILConfig
 from fmpjax.priors import Expert, Rollout, adversary, amp, barycentric, empirical
-from fmpjax.train import TrainState
+from fmpjax.trainer import TrainState
 
 STEPS, COUNT = 8, 32  # of a rollout
 SMALL = Config(

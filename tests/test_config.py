@@ -9,7 +9,7 @@ import pytest
 from fmpjax import config as configuration
 from fmpjax import motion
 from fmpjax.errors import UserError
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 
 def test_paper_preset_is_the_paper():

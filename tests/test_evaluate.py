@@ -10,7 +10,7 @@ from fmpjax import evaluate, jsons, motion
 from fmpjax.config import preset
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Episodes, Evaluator, Start
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 SMALL = {"env.episode_steps": 60, "env.last_cap": 60, "ppo.hidden": (8,), "prior.hidden": (8,)}
 

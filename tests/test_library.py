@@ -17,7 +17,7 @@ from fmpjax.evaluate import planar_speed
 from fmpjax.motion import MotionClip, MotionLibrary, library, load_library
 from fmpjax.motion.clip import refined
 from fmpjax.priors import Expert
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 from tests.test_train import TINY, settings
 
 HORIZON = 10

@@ -47,7 +47,7 @@ from fmpjax.experiments import cells
 print(machine.cores(), physics.make(robots.load("strider"), config.preset("smoke").physics).threads)
 print(runs.provenance()["cores"], runs.machine(), cells._shares(2))
 folder = runs.Run({str(tmp_path)!r})
-with runs._held([folder]):
+with runs.training.held([folder]):
     print("held")
 """
     )

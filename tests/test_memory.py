@@ -9,7 +9,7 @@ from test_train import tiny
 from fmpjax import cli, machine, memory, motion, runs
 from fmpjax.config import preset
 from fmpjax.errors import UserError
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 # Temporary and argument bytes by `compiled.memory_analysis()`, in MB, on a CPU: JAX 0.10.2, the bundled walk.
 MEASURED = {

@@ -15,7 +15,7 @@ from fmpjax import motion, priors, transport
 from fmpjax.config import preset
 from fmpjax.errors import UserError
 from fmpjax.priors import MotionPrior, Rollout, pwil, smp, wail
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 
 def changed(section, **values):

@@ -43,6 +43,7 @@ def test_wheel_holds_the_package_and_nothing_beside_it(wheel):
     assert {name.split("/")[0].partition("-")[0] for name in names} == {"fmpjax"}
     modules = {path.relative_to(ROOT).as_posix() for path in (ROOT / "fmpjax").rglob("*.py")}
     assert modules == {name for name in names if name.endswith(".py")}
+    assert "fmpjax/py.typed" in names
 
 
 def test_installed_wheel_loads_the_robot_away_from_the_checkout(wheel, tmp_path):

@@ -7,7 +7,7 @@ from test_train import tiny
 
 from fmpjax import motion, policy
 from fmpjax.errors import UserError
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from fmpjax import features, motion, priors
 from fmpjax.errors import UserError
 from fmpjax.experiments import ranking
 from fmpjax.frames import FrameLayout
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ from PIL import Image
 
 from fmpjax import robots, runs
 from fmpjax.errors import UserError
+from fmpjax.runs import outputs
 from fmpjax.viz import curves, render
 
 SIZE = {"width": 96, "height": 72}
@@ -164,10 +165,10 @@ def test_a_picture_that_fails_does_not_fail_a_finished_training(tmp_path, monkey
 
     (tmp_path / "metrics.csv").write_text("")
     run = runs.Run(tmp_path)
-    monkeypatch.setattr(runs, "_stride_frames", fail)
-    monkeypatch.setattr(runs, "video", refuse)
-    monkeypatch.setattr(runs.curves, "learning_curves", lambda table, picture: picture)
-    assert runs._pictures(run, None, None) == [tmp_path / "curves.png"]
+    monkeypatch.setattr(outputs, "_stride_frames", fail)
+    monkeypatch.setattr(outputs, "video", refuse)
+    monkeypatch.setattr(outputs.curves, "learning_curves", lambda table, picture: picture)
+    assert outputs._pictures(run, None, None) == [tmp_path / "curves.png"]
     assert capsys.readouterr().err == "no frames.png: no driver\nno policy.mp4: cannot write policy.mp4: no space\n"
 
 

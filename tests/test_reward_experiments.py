@@ -27,7 +27,7 @@ from fmpjax.experiments import (
     table,
 )
 from fmpjax.priors import flow
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 SMALL = PriorConfig(bank=16, minibatch=16, hidden=(8,))
 

@@ -13,7 +13,7 @@ from test_train import TINY, settings, tiny
 
 from fmpjax import cli, motion, priors, runs, sharding
 from fmpjax.errors import UserError
-from fmpjax.train import Trainer, stack, unstack
+from fmpjax.trainer import Trainer, stack, unstack
 
 DEVICES = 4
 

@@ -8,7 +8,7 @@ from test_train import tiny
 
 from fmpjax import ppo, runs
 from fmpjax.experiments import standing
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 STEPS, COUNT = 250, 20
 

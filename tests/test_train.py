@@ -28,7 +28,7 @@ from fmpjax.errors import UserError
 from fmpjax.evaluate import Episodes, Evaluation, Evaluator
 from fmpjax.logs import MetricsLog
 from fmpjax.priors import Expert
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 # Eight environments, eight steps, five chunks of two iterations: a second of training after the compilation.
 TINY = {
@@ -262,8 +262,8 @@ def test_a_larger_budget_goes_on_as_if_it_had_been_the_first(trained, tmp_path, 
     """A signal in its last iterations costs the first budget nothing, not even the evaluation at its end."""
     run = runs.Run.create(tmp_path / "run", tiny(transitions=TINY["transitions"] // 5))
     with monkeypatch.context() as patch:
-        patch.setattr(runs._StopSignals, "__enter__", lambda self: setattr(self, "requested", True) or self)
-        patch.setattr(runs._StopSignals, "__exit__", lambda *_: None)
+        patch.setattr(runs.training.StopSignals, "__enter__", lambda self: setattr(self, "requested", True) or self)
+        patch.setattr(runs.training.StopSignals, "__exit__", lambda *_: None)
         assert runs.train(run) is runs.End.BUDGET
     assert rows(run.folder)[-1]["eval/quality"] and Checkpoints(run.folder).latest(best=True) == 2
     run.extend(TINY["transitions"])
@@ -320,7 +320,7 @@ def test_rows_beyond_the_checkpoint_are_written_again(trained, tmp_path, monkeyp
     shutil.rmtree(folder / "checkpoints" / "10")
     expected = rows(folder)
     # Checkpoints come by the clock too: with no interval, after every chunk.
-    monkeypatch.setattr(runs, "_SAVE_INTERVAL", 0.0)
+    monkeypatch.setattr(runs.clock, "SAVE_INTERVAL", 0.0)
     assert runs.train(runs.Run.open(folder), resume=True) is runs.End.BUDGET
     assert rows(folder) == expected
     assert {p.name for p in (folder / "checkpoints").iterdir() if p.name.isdigit()} == {"6", "8", "10"}
@@ -336,14 +336,14 @@ def test_a_resume_never_begins_anew_over_what_is_there(trained, trainer, tmp_pat
     shutil.copytree(trained, one)
     shutil.rmtree(one / "checkpoints")
     best = Checkpoints(trained).latest(best=True)
-    (state,) = runs._start(trainer, [runs.Run.open(one)], True)
+    (state,) = runs.session.first_states(trainer, [runs.Run.open(one)], True)
     assert int(state.iteration) == best
     shutil.copytree(one, other)
     (other / "best" / str(best)).rename(other / "best" / "99")
     with pytest.raises(UserError, match=rf"one has \[{best}\], .*other has \[99\]: expected a checkpoint of one iter"):
-        runs._start(trainer, [runs.Run.open(one), runs.Run.open(other)], True)
+        runs.session.first_states(trainer, [runs.Run.open(one), runs.Run.open(other)], True)
     shutil.rmtree(one / "best")
-    assert int(runs._start(trainer, [runs.Run.open(one)], True)[0].iteration) == 0
+    assert int(runs.session.first_states(trainer, [runs.Run.open(one)], True)[0].iteration) == 0
 
 
 @pytest.mark.slow
@@ -561,7 +561,7 @@ def test_memory_that_runs_out_leaves_the_last_checkpoint_good(trained, tmp_path,
 
         return call
 
-    monkeypatch.setattr(runs, "_SAVE_INTERVAL", -1.0)  # a checkpoint after every call
+    monkeypatch.setattr(runs.clock, "SAVE_INTERVAL", -1.0)  # a checkpoint after every call
     monkeypatch.setattr(Trainer, "compile", compile_and_fail)
     with pytest.raises(UserError) as told:
         runs.train(runs.Run.open(folder), resume=True)
@@ -603,8 +603,9 @@ def test_quality(falls, speed, demonstration, expected):
 @pytest.mark.slow
 def test_a_video_is_as_long_as_it_is_asked_to_be(trainer, fallen, tmp_path, monkeypatch):
     shown = []
-    monkeypatch.setattr(runs.render, "grid", lambda robot, motions, labels, **_: shown.extend(map(len, motions)))
-    monkeypatch.setattr(runs.render, "write_video", lambda path, frames, fps: path)
+    render = runs.outputs.render
+    monkeypatch.setattr(render, "grid", lambda robot, motions, labels, **_: shown.extend(map(len, motions)))
+    monkeypatch.setattr(render, "write_video", lambda path, frames, fps: path)
     runs.video(runs.Run(tmp_path), trainer, fallen._replace(length=np.full(6, 60)), seconds=0.4)
     assert shown == [10, 10]  # 20 steps of 0.02 s, every second one
 

@@ -22,7 +22,7 @@ from fmpjax.features import FeatureMap
 from fmpjax.frames import PLANAR, FrameLayout
 from fmpjax.priors.barycentric import BarycentricState
 from fmpjax.shell import default
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 from fmpjax.viz import panels
 from fmpjax.viz.panels import Line, Panel
 

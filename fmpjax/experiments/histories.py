@@ -13,7 +13,7 @@ from fmpjax.errors import UserError
 from fmpjax.features import FeatureMap
 from fmpjax.frames import FrameLayout
 from fmpjax.ppo import PPOState
-from fmpjax.train import Trainer, TrainState
+from fmpjax.trainer import Trainer, TrainState
 
 SOON = (0.34, 0.64)  # s after a reset, from which executed histories are drawn [P]
 

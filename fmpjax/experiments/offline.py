@@ -24,7 +24,7 @@ from fmpjax.experiments.reference import Reference, centred_error, correlation, 
 from fmpjax.logs import Progress, clock
 from fmpjax.priors import flow
 from fmpjax.shell import default
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the way from a rollout's window to an expert's [P]
 BLOCK = 128  # updates of one call, as many as the paper's of a rollout: the parameter average starts anew in each [P]

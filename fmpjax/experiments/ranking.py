@@ -17,7 +17,7 @@ from fmpjax import features, jsons, priors
 from fmpjax.experiments import histories, results
 from fmpjax.motion import MotionClip, resample
 from fmpjax.shell import default
-from fmpjax.train import Trainer
+from fmpjax.trainer import Trainer
 
 
 def copies(trainer: Trainer, seed: int = 0) -> dict[str, np.ndarray]:

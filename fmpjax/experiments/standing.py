@@ -27,7 +27,7 @@ from fmpjax.priors import flow
 from fmpjax.priors.base import couple, median_reward
 from fmpjax.robots import Robot
 from fmpjax.shell import Group, default
-from fmpjax.train import Trainer, TrainState
+from fmpjax.trainer import Trainer, TrainState
 from fmpjax.viz import curves
 
 STANDING, WALKING = 0.15, 0.40  # m/s, mean forward speed of a window below or above which it counts as such

@@ -1,0 +1,26 @@
+"""A run on disk: its folder, its training from start or checkpoint to a clean end, and what it leaves to look at."""
+
+from fmpjax.files import without_places, write
+from fmpjax.provenance import machine, provenance
+from fmpjax.runs.clock import End
+from fmpjax.runs.folder import Run, check_trainable, default_folder, default_preset, describe, load_motion
+from fmpjax.runs.outputs import export, finish, video
+from fmpjax.runs.training import train
+
+__all__ = [
+    "End",
+    "Run",
+    "check_trainable",
+    "default_folder",
+    "default_preset",
+    "describe",
+    "export",
+    "finish",
+    "load_motion",
+    "machine",
+    "provenance",
+    "train",
+    "video",
+    "without_places",
+    "write",
+]

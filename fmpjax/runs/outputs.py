@@ -1,0 +1,150 @@
+"""What a run leaves to look at and to take away: evaluation, curves, pictures, a film, policy files."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from fmpjax import deploy, diagnose, jsons, policy
+from fmpjax.errors import UserError
+from fmpjax.evaluate import Episodes, table
+from fmpjax.files import without_places, write
+from fmpjax.logs import MetricsLog
+from fmpjax.runs.folder import Run
+from fmpjax.trainer import Trainer
+from fmpjax.viz import curves, render
+
+_EXPORTED = (
+    "metrics.csv evaluation.json ranking-start.json ranking.json curves.png frames.png policy.mp4 policy.gif"
+).split()
+
+
+def finish(run: Run) -> list[Path]:
+    """Evaluate the run's best policy, and write its table, learning curves and video; the paths written.
+
+    A picture that cannot be made is left out.
+    """
+    trainer, state = run.policy()
+    played = run.evaluator().play(state.ppo)
+    evaluation = run.evaluator().measure(played)
+    run.save_evaluation(evaluation)
+    transitions = int(state.iteration) * trainer.config.transitions_per_iteration
+    print(f"best policy, {transitions:,} transitions:\n{table(evaluation)}")
+    paths = [run.folder / "evaluation.json", *_pictures(run, trainer, played)]
+    if (run.folder / "metrics.csv").exists() and MetricsLog.read(run.folder / "metrics.csv"):
+        print(diagnose.text(diagnose.read(run.folder)))
+    return paths
+
+
+def _pictures(run: Run, trainer: Trainer, played: Episodes) -> list[Path]:
+    """Draw a finished run; a picture that cannot be made is left out, which a line says."""
+
+    def frames() -> Path:
+        return render.contact_sheet(run.folder / "frames.png", _stride_frames(trainer, played), columns=6)
+
+    def course() -> Path:
+        return curves.learning_curves(run.folder / "metrics.csv", run.folder / "curves.png")
+
+    makers = {"frames.png": frames}
+    makers |= {"curves.png": course} if (run.folder / "metrics.csv").exists() else {}
+    makers |= {"policy.mp4": lambda: video(run, trainer, played)}
+    paths = []
+    for name, make in makers.items():
+        try:
+            paths.append(make())
+        except Exception as error:  # whatever it is, the training is finished
+            print(f"no {name}: {str(error) or type(error).__name__}", file=sys.stderr)
+    return paths
+
+
+def export(run: Run, out: Path, *, onnx: bool = False) -> list[Path]:
+    """Copy what a run has to show, and its policy, without states and demonstration, into ``out``; the paths written.
+
+    With ``onnx`` the policy is also written for other programs, as `fmpjax.deploy` does it.
+
+    Raises:
+      UserError: ``out`` holds another run's results, or cannot be written, or there is no policy for ``onnx``.
+    """
+    trained = bool(run.checkpoints.iterations() or run.checkpoints.iterations(best=True))
+    if onnx:
+        deploy.check_installed()
+        if not trained:
+            raise UserError(f"run {run.folder} has no checkpoint: expected one, of which --onnx takes the policy")
+    if out.resolve() == run.folder.resolve():
+        raise UserError(f"{out} is the run itself: expected another folder")
+    # Where the demonstration and the run lay is this machine's affair; their names are everybody's.
+    places = [*(name for name, _ in run.motions(run.config)), run.folder.resolve(), run.folder]
+    texts = {"config.json": (run.folder / "config.json").read_text().rstrip("\n")}
+    texts["provenance.json"] = jsons.dumps(run.provenance())
+    texts = {n: without_places(text, places) for n, text in texts.items()}
+    if (out / "config.json").exists() and (out / "config.json").read_text().rstrip("\n") != texts["config.json"]:
+        raise UserError(f"{out} holds results of another configuration: expected a new folder or this run's own")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for n, text in texts.items():
+            write(out / n, text)
+        copied = [Path(shutil.copy2(run.folder / n, out / n)) for n in _EXPORTED if (run.folder / n).exists()]
+        if trained:
+            trainer, state = run.policy()
+            learned = policy.of(trainer, state.ppo)
+            copied.append(policy.save(out / "policy.npz", learned))
+            if onnx:
+                copied += deploy.write(out, learned, trainer.robot, _origin(run))
+        return [*(out / n for n in texts), *copied]
+    except OSError as error:
+        raise UserError(f"folder {out} cannot be written: {error.strerror}") from None
+
+
+def _origin(run: Run) -> deploy.Origin:
+    """Where the run's policy comes from, as its ONNX file and its card say."""
+    path = run.folder / "evaluation.json"
+    try:
+        evaluation = json.loads(path.read_text()) if path.exists() else None
+    except ValueError:
+        raise UserError(f"{path} is not valid JSON: expected what `fmpjax evaluate` writes") from None
+    return deploy.Origin(
+        run=run.folder.resolve().name,
+        config=run.config,
+        motions=tuple(run.motions(run.config)),
+        commit=run.provenance().get("commit"),
+        evaluation=evaluation,
+        changed=bool(run.provenance().get("uncommitted_changes")),
+    )
+
+
+def video(
+    run: Run,
+    trainer: Trainer,
+    played: Episodes,
+    *,
+    seconds: float = 10.0,
+    path: Path | None = None,
+    alone: bool = False,
+) -> Path:
+    """The policy beside the demonstration, or alone, as a video; the path written."""
+    rate = trainer.config.control_rate
+    stride = 2  # 25 pictures a second
+    episode = _longest(played)
+    last = min(int(seconds * rate), len(played.qpos))
+    shown = {"policy": played.qpos[: min(last, int(played.length[episode])) : stride, episode]}
+    if not alone:
+        shown["demonstration"] = trainer.library.clips[played.clip[episode]].qpos[:last:stride]
+    panes = len(shown)
+    frames = render.grid(trainer.robot, list(shown.values()), list(shown), columns=panes, width=360 * panes, height=360)
+    return render.write_video(path or run.folder / "policy.mp4", frames, fps=rate / stride)
+
+
+def _longest(played: Episodes) -> int:
+    """The longest episode, which shows most; ties go to the first."""
+    return int(np.argmax(played.length))
+
+
+def _stride_frames(trainer: Trainer, played: Episodes) -> np.ndarray:
+    """Twelve pictures of one second of the policy, from the late part of its longest episode."""
+    episode = _longest(played)
+    length = int(played.length[episode])
+    last = min(length - 1, int(0.7 * len(played.qpos)))
+    rows = np.linspace(max(0, last - int(trainer.config.control_rate)), last, 12).astype(int)
+    return render.render_frames(trainer.robot, played.qpos[rows, episode], width=320, height=320)
