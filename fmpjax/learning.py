@@ -1,4 +1,4 @@
-"""What the policy and the priors learn with: networks, optimizer steps, running statistics, summaries of scores."""
+"""What the policy and the priors learn with: networks, optimizer steps, running means, summaries of scores."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -117,7 +117,7 @@ def permutation(key: jax.Array, count: int) -> jax.Array:
     return (jnp.sort(drawn | jnp.arange(count, dtype=jnp.uint32)) & (2**bits - 1)).astype(jnp.int32)
 
 
-# --- running statistics ----------------------------------------------------------------------------------------------
+# --- running means ---------------------------------------------------------------------------------------------------
 
 
 def toward(old: Any, new: Any, share: jax.Array | float) -> Any:
@@ -133,57 +133,6 @@ def newest_share(half_life: float) -> float:
 def standardize(x: jax.Array, mean: jax.Array, deviation: jax.Array, clip: float) -> jax.Array:
     """``(x - mean) / deviation``, clipped to the magnitude ``clip``."""
     return jnp.clip((x - mean) / deviation, -clip, clip)
-
-
-class Count(NamedTuple):
-    """A count of 64 bits, in the 32-bit numbers that JAX has by default."""
-
-    hi: jax.Array  # scalar uint32
-    lo: jax.Array  # scalar uint32
-
-    def __add__(self, more: jax.Array) -> "Count":
-        """The count ``more`` later, a scalar uint32."""
-        lo = self.lo + more
-        return Count(self.hi + (lo < self.lo), lo)
-
-    def rounded(self) -> jax.Array:
-        """The count as float32, to rounding."""
-        return self.hi.astype(jnp.float32) * 2.0**32 + self.lo.astype(jnp.float32)
-
-
-class Statistics(NamedTuple):
-    """Running mean and standard deviation of all rows seen."""
-
-    mean: jax.Array  # [D]
-    std: jax.Array  # [D]
-    count: Count  # rows
-    summed_variance: jax.Array  # [D], variance times count
-    std_eps: jax.Array  # scalar 0, which no one reads; it keeps older checkpoints readable
-
-    @classmethod
-    def empty(cls, size: int) -> "Statistics":
-        """Before the first row: mean 0, deviation 1."""
-        nothing = Count(jnp.uint32(0), jnp.uint32(0))
-        return cls(jnp.zeros(size), jnp.ones(size), nothing, jnp.zeros(size), jnp.float32(0.0))
-
-    def after(self, rows: jax.Array, floor: float) -> "Statistics":
-        """The statistics after ``rows [n, D]``, by Welford's formula; deviations are at least ``floor``."""
-        # The program counts the rows. In place of a division by a constant, XLA multiplies by its reciprocal. That
-        # rounds otherwise, and every seed would begin in another state.
-        count = self.count + jnp.prod(jnp.array(rows.shape[:1], jnp.uint32))
-        total = count.rounded()
-        off = rows - self.mean
-        mean = self.mean + jnp.sum(off, axis=0) / total
-        summed = self.summed_variance + jnp.sum(off * (rows - mean), axis=0)
-        # Rounding may leave the sum below zero.
-        deviation = jnp.sqrt(jnp.maximum(summed, 0.0) / total)
-        return Statistics(mean, jnp.clip(deviation, floor, 1e6), count, summed, self.std_eps)
-
-    def capped(self, most: int) -> "Statistics":
-        """The statistics with a count of at most ``most``, so that old rows fade at the rate of new ones."""
-        fade = jnp.minimum(1.0, most / jnp.maximum(self.count.rounded(), 1.0))
-        count = Count(self.count.hi * 0, jnp.minimum(self.count.lo, jnp.uint32(most)))
-        return self._replace(count=count, summed_variance=self.summed_variance * fade)
 
 
 # --- scores ----------------------------------------------------------------------------------------------------------

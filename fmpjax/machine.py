@@ -2,6 +2,7 @@
 
 import contextlib
 import hashlib
+import io
 import os
 import platform
 import sys
@@ -90,6 +91,12 @@ def import_mujoco() -> None:
             import mujoco  # noqa: F401
         finally:
             _restore("MUJOCO_GL", before["MUJOCO_GL"])
+
+
+def import_mjx() -> None:
+    """Import MJX, which prints where Warp, which is optional, is not installed."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        import mujoco.mjx  # noqa: F401
 
 
 def _restore(name: str, value: str | None) -> None:

@@ -1,6 +1,7 @@
 """Proximal policy optimisation (section IV-A of the paper; the settings are MimicKit's).
 
-An update fits the critic to TD(lambda) returns first and then improves the actor, each for its own number of epochs.
+Hidden layers, the critic and the running statistics of observations are Brax's. An update fits the critic to TD(lambda)
+returns first and then improves the actor, each for its own number of epochs.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,10 +13,16 @@ import numpy as np
 import optax
 from flax import linen
 
-from fmpjax import learning, sharding
+from fmpjax import learning, machine, sharding
 from fmpjax.acting import Policy
 from fmpjax.config import PPOConfig
-from fmpjax.learning import MLP, Statistics
+
+machine.import_mjx()  # which Brax imports
+
+from brax.training.acme import running_statistics  # noqa: E402 - after MJX
+from brax.training.acme.running_statistics import RunningStatisticsState  # noqa: E402
+from brax.training.networks import MLP  # noqa: E402
+from brax.training.types import UInt64  # noqa: E402
 
 
 class PPOState(NamedTuple):
@@ -25,7 +32,7 @@ class PPOState(NamedTuple):
     critic: Any
     actor_optimizer: optax.OptState
     critic_optimizer: optax.OptState
-    normalizer: Statistics  # of the observations
+    normalizer: RunningStatisticsState  # of the observations
     rate: jax.Array  # scalar, learning rate of both
 
 
@@ -58,8 +65,7 @@ class Actor(linen.Module):
 
     @linen.compact
     def __call__(self, x):
-        inits = [self.kernel_init] * len(self.hidden)
-        x = MLP(self.hidden, inits, self.activation, activate_last=True, name=_TRUNK)(x)
+        x = MLP(self.hidden, self.activation, self.kernel_init, activate_final=True, name=_TRUNK)(x)
         mean = linen.Dense(self.size, kernel_init=learning.uniform(self.mean_init), name=_MEAN)(x)
         start = lambda key: {"log_value": jnp.full((self.size,), jnp.log(self.deviation))}  # noqa: E731
         deviation = jnp.exp(self.param(_DEVIATION, start)["log_value"])
@@ -86,8 +92,7 @@ class PPO:
         uniform = initializers.variance_scaling(1 / 3, "fan_in", "uniform")
         kernel = initializers.orthogonal(2.0**0.5) if config.orthogonal else uniform
         self._actor = Actor(action_size, config.hidden, activation, kernel, config.mean_init, config.deviation)
-        widths = (*config.hidden, 1)
-        self._critic = MLP(widths, [kernel] * len(widths), activation)
+        self._critic = MLP((*config.hidden, 1), activation, kernel)
         clip = [optax.clip_by_global_norm(config.clip_norm)] if config.clip_norm else []
         self._optimizer = optax.chain(*clip, learning.direction(config.optimizer, config.momentum))
 
@@ -96,24 +101,23 @@ class PPO:
         actor_key, critic_key = jax.random.split(key)
         actor = self._actor.init(actor_key, jnp.zeros((1, self.observation_size)))
         critic = self._critic.init(critic_key, jnp.zeros((1, self.observation_size + bool(self.clock))))
-        normalizer = Statistics.empty(self.observation_size)
+        normalizer = running_statistics.init_state(jnp.zeros(self.observation_size))
         if self.config.normalizer_from_clip and observations is not None:
             normalizer = self.observe(normalizer, jnp.asarray(observations))
         optimizer = self._optimizer
         rate = jnp.float32(self.config.learning_rate)
         return PPOState(actor, critic, optimizer.init(actor), optimizer.init(critic), normalizer, rate)
 
-    def observe(self, normalizer: Statistics, observations: jax.Array) -> Statistics:
+    def observe(self, normalizer: RunningStatisticsState, observations: jax.Array) -> RunningStatisticsState:
         """Running statistics after ``observations [..., O]``."""
         flat = observations.reshape(-1, observations.shape[-1])
-        normalizer = normalizer.after(flat, self.config.normalizer_floor)
-        # A capped count keeps the statistics following the policy.
-        return normalizer.capped(self.config.normalizer_count) if self.config.normalizer_count else normalizer
+        normalizer = running_statistics.update(normalizer, flat, std_min_value=self.config.normalizer_floor)
+        return capped(normalizer, self.config.normalizer_count) if self.config.normalizer_count else normalizer
 
-    def _normalized(self, normalizer: Statistics, observation: jax.Array) -> jax.Array:
+    def _normalized(self, normalizer: RunningStatisticsState, observation: jax.Array) -> jax.Array:
         return learning.standardize(observation, normalizer.mean, normalizer.std, self.config.normalizer_clip)
 
-    def policy(self, actor, normalizer: Statistics, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def policy(self, actor, normalizer: RunningStatisticsState, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Mean and deviation ``[..., J]`` of the action distribution."""
         mean, deviation = self._actor.apply(actor, self._normalized(normalizer, observation))
         return mean, deviation if self.config.learn_deviation else jax.lax.stop_gradient(deviation)
@@ -141,7 +145,7 @@ class PPO:
         """Value estimates ``[...]`` after ``age [...]`` steps of an episode, which only a critic with a clock reads."""
         return self._values(state.critic, state.normalizer, observation, age)
 
-    def _values(self, critic, normalizer: Statistics, observation, age):
+    def _values(self, critic, normalizer: RunningStatisticsState, observation, age):
         x = self._normalized(normalizer, observation)
         if self.clock:
             x = jnp.concatenate([x, age[..., None] / self.clock], axis=-1)
@@ -267,6 +271,14 @@ def kl_divergence(old_mean, old_deviation, mean, deviation) -> jax.Array:
     squares = jnp.square(old_deviation) + jnp.square(old_mean - mean)
     terms = jnp.log(deviation / old_deviation + 1e-5) + squares / (2.0 * jnp.square(deviation)) - 0.5
     return jnp.sum(terms, axis=-1)
+
+
+def capped(statistics: RunningStatisticsState, most: int) -> RunningStatisticsState:
+    """The statistics with a count of at most ``most``, so that old rows fade at the rate of new ones."""
+    count = statistics.count.hi.astype(jnp.float32) * 2.0**32 + statistics.count.lo.astype(jnp.float32)
+    fade = jnp.minimum(1.0, most / jnp.maximum(count, 1.0))
+    count = UInt64(statistics.count.hi * 0, jnp.minimum(statistics.count.lo, jnp.uint32(most)))
+    return statistics.replace(count=count, summed_variance=statistics.summed_variance * fade)
 
 
 def generalized_advantage(

@@ -8,7 +8,7 @@ import pytest
 from flax import linen
 
 from fmpjax import learning
-from fmpjax.learning import MLP, Count, Statistics
+from fmpjax.learning import MLP
 
 
 def test_elu_is_flaxs_with_its_derivative():
@@ -60,19 +60,6 @@ def test_a_step_is_taken_where_all_is_finite(rate, fault):
     np.testing.assert_array_equal(trace, [3.0, 4.0] if taken else [0.0, 0.0])
     if taken:
         assert float(step.gradient_norm) == 5.0
-
-
-@pytest.mark.parametrize("before", [0, 5, 2**32 - 8, 2**32 - 7, 2**33 + 1, 3 * 2**32 - 1])
-def test_a_count_goes_beyond_32_bits(before):
-    count = Count(jnp.uint32(before >> 32), jnp.uint32(before & 0xFFFFFFFF)) + jnp.uint32(7)
-    assert (int(count.hi) << 32) + int(count.lo) == before + 7
-    np.testing.assert_allclose(count.rounded(), before + 7, rtol=1e-7)
-
-
-def test_statistics_keep_the_leaves_of_older_checkpoints():
-    leaves, _ = jax.tree_util.tree_flatten_with_path(Statistics.empty(3))
-    names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves]
-    assert names == ["mean", "std", "count.hi", "count.lo", "summed_variance", "std_eps"]
 
 
 def test_the_share_of_an_old_update_halves_in_a_half_life():

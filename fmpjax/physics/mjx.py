@@ -1,21 +1,21 @@
 """MJX: the physics on the device, for accelerators."""
 
-import contextlib
-import io
 from typing import NoReturn
 
 import jax
 import jax.numpy as jnp
 import mujoco
 
-with contextlib.redirect_stdout(io.StringIO()):  # MJX prints where Warp, which is optional, is not installed
-    from mujoco import mjx
-
+from fmpjax import machine
 from fmpjax.config import PhysicsConfig
 from fmpjax.errors import UserError
 from fmpjax.physics.base import PhysicsState
 from fmpjax.physics.native import model
 from fmpjax.robots import Robot
+
+machine.import_mjx()
+
+from mujoco import mjx  # noqa: E402 - after it was imported without a word
 
 
 class MjxPhysics:
