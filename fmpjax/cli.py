@@ -69,7 +69,7 @@ class Train:
     resume: bool = False
     """Go on with the run in --run, with its settings."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Any other setting as section.field=value; see `fmpjax config`."""
+    """Any other setting as section.field=value; `fmpjax settings` explains all of them."""
 
     def __call__(self) -> None:
         if self.minutes is not None and not self.minutes > 0:
@@ -316,6 +316,23 @@ class ShowConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class Settings:
+    """Explain every setting: its default in each preset, its meaning and what it may be."""
+
+    section: tyro.conf.Positional[str] = ""
+    """A section, such as `ppo`, or one setting; all of them where it is left out."""
+    markdown: bool = False
+    """Print the page docs/settings.md, which has all of them."""
+
+    def __call__(self) -> None:
+        from fmpjax.config import explaining
+
+        if self.markdown and self.section:
+            raise UserError(f"--markdown prints all settings: expected no section, not {self.section!r}")
+        print(explaining.markdown() if self.markdown else explaining.text(self.section), end="")
+
+
+@dataclasses.dataclass(frozen=True)
 class List:
     """List methods, presets, robots and motions, each with what it is."""
 
@@ -353,7 +370,8 @@ COMMANDS = shell.Group(
     "Flow-Matched Motion Priors in JAX. `fmpjax --version` prints the version.",
     {
         "train": Train, "evaluate": Evaluate, "diagnose": Diagnose, "render": Render, "export": Export,
-        "sim2sim": Sim2Sim, "report": Report, "motion": MOTION, "config": ShowConfig, "list": List,
+        "sim2sim": Sim2Sim, "report": Report, "motion": MOTION, "config": ShowConfig, "settings": Settings,
+        "list": List,
     },
 )  # fmt: skip
 

@@ -18,9 +18,14 @@ from fmpjax.motion import MotionClip
 from fmpjax.ppo import PPOState
 from fmpjax.trainer import Trainer
 
+# The definitions of the figures, beside those in `metrics`.
 DETAILED = 64  # episodes whose late speed, joints and feet are analysed [P]
 WINDOWS = 512  # windows at most on either side of the Sinkhorn discrepancy [D]
 CONTACT_HEIGHT = 0.01  # m, a foot is in contact where a sole point is lower [D]
+LEAST_SPEED = 0.1  # m/s, to which an error in speed is relative at least [D]
+OTHER_SIZES = 3  # times fewer episodes at the sizes of perturbation that are not the headline's [D]
+STARTS_SEED = 1  # of the episodes' starts, the same in every evaluation [D]
+DISCREPANCY_THRESHOLD, DISCREPANCY_ITERATIONS = 1e-4, 2000  # marginal error (L1) of its solves; iterations at most [D]
 
 
 class Start(NamedTuple):
@@ -90,7 +95,8 @@ class Evaluation:
         Too fast is no better than too slow. Where the demonstration turns, speeds are along the own heading.
         """
         late = self.path_speed if self.demonstration_turning > metrics.TURNS else self.late_speed
-        error = 1.0 if np.isnan(late) else abs(late - self.demonstration_speed) / max(self.demonstration_speed, 0.1)
+        unit = max(self.demonstration_speed, LEAST_SPEED)
+        error = 1.0 if np.isnan(late) else abs(late - self.demonstration_speed) / unit
         return (1.0 - self.falls / self.episodes) * max(0.0, 1.0 - error)
 
     def as_dict(self) -> dict[str, float]:
@@ -130,7 +136,7 @@ def episodes_of(config: Config, episodes: int) -> dict[float, int]:
     """
     fixed, sizes = config.env.reset == "fixed", sorted(config.evaluation_noise)
     headline = next((size for size in sizes if size > 0 or not fixed), sizes[0])
-    counts = {headline: episodes} | {size: -(-episodes // 3) for size in sizes if size != headline}
+    counts = {headline: episodes} | {size: -(-episodes // OTHER_SIZES) for size in sizes if size != headline}
     return counts | ({0.0: 1} if fixed and 0.0 in counts else {})
 
 
@@ -140,7 +146,7 @@ class Evaluator:
     Every size of perturbation is in one batch, the headline's episodes first.
     """
 
-    def __init__(self, trainer: Trainer, episodes: int | None = None, seed: int = 1):
+    def __init__(self, trainer: Trainer, episodes: int | None = None, seed: int = STARTS_SEED):
         self.trainer = trainer
         robot, env = trainer.robot, trainer.env
         self._sizes = episodes_of(trainer.config, episodes or trainer.config.evaluation_episodes)
@@ -309,7 +315,7 @@ def discrepancy(x: jax.Array, y: jax.Array, dimension: jax.Array) -> jax.Array:
         transport.squared_cost(x, x),
         transport.squared_cost(y, y),
         epsilon=epsilon,
-        solve_kwargs={"threshold": 1e-4, "max_iterations": 2000},
+        solve_kwargs={"threshold": DISCREPANCY_THRESHOLD, "max_iterations": DISCREPANCY_ITERATIONS},
     )
     return value
 

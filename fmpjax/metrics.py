@@ -10,13 +10,15 @@ import dataclasses
 
 import numpy as np
 
+from fmpjax.config import Config
 from fmpjax.errors import UserError
 
-RATE = 50.0  # Hz, control steps
-LATE_START, LATE_END = 5.0, 10.0  # s, both included
-WINDOW = 1.0  # s, of a joint range
-PERCENTILES = 5.0, 95.0
-STILL = 1e-6  # rad; a joint whose expert range is smaller has no ratio to it
+# The definitions of the figures.
+RATE = Config().control_rate  # Hz, the paper's control steps
+LATE_START, LATE_END = 5.0, 10.0  # s, both included [P]
+WINDOW = 1.0  # s, of a joint range [P]
+PERCENTILES = 5.0, 95.0  # between which a joint range lies [P]
+STILL = 1e-6  # rad; a joint whose expert range is smaller has no ratio to it [D]
 TURNS = 0.1  # rad/s, from which a demonstration turns [D]
 
 

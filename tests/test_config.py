@@ -1,13 +1,17 @@
 """The presets: the paper's numbers to the letter, and every one of them trains."""
 
 import json
+import re
+import typing
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
+from fmpjax import cli, motion
 from fmpjax import config as configuration
-from fmpjax import motion
+from fmpjax.config import explaining, reading
 from fmpjax.errors import UserError
 from fmpjax.trainer import Trainer
 
@@ -118,3 +122,117 @@ def test_bad_settings_are_named(changes, words):
 def test_unknown_preset():
     with pytest.raises(UserError, match="unknown preset 'huge': expected one of smoke, laptop, paper"):
         configuration.preset("huge")
+
+
+# --- types where the numbers stand -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", configuration.PRESETS)
+def test_presets_are_what_their_types_allow(name):
+    config = configuration.preset(name)
+    assert configuration.validate(config) is config
+    assert configuration.from_json(configuration.to_json(config)) == config
+    assert hash(config) == hash(configuration.preset(name))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("ppo.hidden", "8,0", "whole numbers of at least 1, with commas between"),
+        ("ppo.hidden", 8, "whole numbers of at least 1, with commas between"),
+        ("prior.flow_weight", -1.0, "a number of at least 0"),
+        ("prior.query_share", 0.0, "a number above 0 and at most 1"),
+        ("ppo.momentum", 1.0, "a number of at least 0 and below 1"),
+        ("physics.iterations", "0", "a whole number of at least 1"),
+        ("features.history", 65, "a whole number of at least 2 and at most 64"),
+        ("evaluations", "0.5,1.5", "numbers above 0 and at most 1, with commas between"),
+        ("smp.score_steps", "", "one or more whole numbers of at least 0, with commas between"),
+        ("wail.optimizer", "lion", "one of adam, sgd"),
+        ("ppo.orthogonal", 2, "true or false"),
+        ("env.count", True, "a whole number of at least 1"),
+        ("env.count", None, "a whole number of at least 1"),
+        ("motion", 3, "text"),
+        ("ppo.fall_value", "nan", "a number"),
+    ],
+)
+def test_a_value_outside_its_type_is_refused_with_the_type_in_words(key, value, expected):
+    with pytest.raises(UserError) as refused:
+        configuration.preset("laptop", **{key: value})
+    assert str(refused.value) == f"setting {key} is {value!r}: expected {expected}"
+
+
+def test_values_of_a_configuration_made_by_hand_are_checked():
+    config = configuration.Config(env=configuration.EnvConfig(count=-1))
+    with pytest.raises(UserError, match="setting env.count is -1: expected a whole number of at least 1"):
+        configuration.validate(config)
+
+
+def test_values_are_taken_as_people_and_numpy_write_them():
+    config = configuration.preset(
+        "laptop",
+        transitions="1_000_000",
+        motion=Path("walks") / "mine.npz",
+        evaluations=np.array([0.5, 1.0]),
+        **{"env.count": np.int64(64), "ppo.hidden": "(32, 16)", "ppo.clip": " 1e-1", "chunk": 5.0},
+    )
+    assert config.transitions == 1_000_000 and config.motion == "walks/mine.npz"
+    assert (config.env.count, config.ppo.hidden, config.ppo.clip, config.chunk) == (64, (32, 16), 0.1, 5)
+    assert config.evaluations == (0.5, 1.0)
+    plain = [config.env.count, config.chunk, *config.evaluations]
+    assert [type(value) for value in plain] == [int, int, float, float]
+
+
+def test_networks_of_the_diffusion_model_are_its_choices():
+    assert set(configuration.SMP_NETWORKS) == set(typing.get_args(reading.types(configuration.SMPConfig)["network"]))
+
+
+# --- explanations ----------------------------------------------------------------------------------------------------
+
+
+def test_every_setting_has_a_meaning_and_a_known_source():
+    known = explaining.settings()
+    assert list(known) == list(configuration.flatten(configuration.Config()))
+    for setting in known.values():
+        assert re.search("[a-z]{3}", re.sub(r"\[.*?\]", "", setting.meaning)), setting
+        sources = re.findall(r"\[([A-Z])", setting.meaning)
+        assert (sources or setting.key == "preset") and set(sources) <= set(explaining.SOURCES), setting
+
+
+def test_a_meaning_is_the_comment_of_the_class_that_sets_the_default():
+    known = explaining.settings()
+    assert known["env.count"].meaning == "parallel environments [P]"
+    assert known["evaluations"].meaning.startswith("shares of the budget at which to evaluate [P]")  # it stands above
+    assert known["wail.updates"].meaning != known["amp.updates"].meaning == known["gail.updates"].meaning
+    assert known["prior.updates"].values == {"paper": 128, "laptop": 3, "smoke": 2}
+
+
+def test_a_section_or_a_setting_is_explained(capsys):
+    cli.main(["settings", "pwil"])
+    printed = capsys.readouterr().out
+    assert "pwil.scale = 5.0\n    alpha, the reward of a perfect step [L]\n    a number above 0\n" in printed
+    assert "[L] PWIL" in printed and "ppo." not in printed
+    cli.main(["settings", "env.count"])
+    printed = capsys.readouterr().out
+    assert printed.startswith("env.count = 1024 (128 in laptop, 16 in smoke)\n") and "env.reset" not in printed
+    assert "prior.query_share = 0.75 (1.0 in laptop and smoke)\n" in explaining.text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["priors"], "unknown section 'priors': did you mean 'prior'?"),
+        (["ppo.discont"], "unknown section 'ppo.discont': did you mean 'ppo.discount'?"),
+        (["xyz"], "unknown section 'xyz': expected one of physics, env, "),
+        (["ppo", "--markdown"], "--markdown prints all settings: expected no section, not 'ppo'"),
+    ],
+)
+def test_an_unknown_section_is_named(capsys, arguments, words):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["settings", *arguments])
+    assert ended.value.code == 2 and capsys.readouterr().err.startswith(f"fmpjax: {words}")
+
+
+def test_the_page_of_settings_is_what_the_command_prints(capsys):
+    cli.main(["settings", "--markdown"])
+    page = Path(__file__).parents[1] / "docs" / "settings.md"
+    assert capsys.readouterr().out == page.read_text(), "run: fmpjax settings --markdown > docs/settings.md"

@@ -112,9 +112,16 @@ def test_episodes_at_each_size(reset, noise, expected):
     assert sum(expected.values()) <= 2 * 256
 
 
-@pytest.mark.parametrize("noise", ["", "0,-0.1", "0,0.001,0.001"])
-def test_bad_sizes_of_noise(noise):
-    with pytest.raises(UserError, match=r"setting evaluation_noise is .*: expected sizes of 0 or more, in rad, each"):
+@pytest.mark.parametrize(
+    ("noise", "expected"),
+    [
+        ("", "one or more numbers of at least 0"),
+        ("0,-0.1", "one or more numbers of at least 0"),
+        ("0,0.001,0.001", "each size once"),
+    ],
+)
+def test_bad_sizes_of_noise(noise, expected):
+    with pytest.raises(UserError, match=f"setting evaluation_noise is .*: expected {expected}"):
         preset("smoke", evaluation_noise=noise)
 
 

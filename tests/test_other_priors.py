@@ -285,12 +285,12 @@ def test_each_trains_through_the_trainer():
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
-        ("smp.network", "tiny", "unknown network 'tiny': expected one of published, small"),
+        ("smp.network", "tiny", "setting smp.network is 'tiny': expected one of published, small"),
         ("smp.score_steps", "8,50", "smp.score_steps is 8, 50: expected noise steps from 0 to 49"),
-        ("smp.average", 1.0, r"smp.average is 1.0: expected a number in \[0, 1\)"),
-        ("wail.gradient_penalty", -1.0, "wail.gradient_penalty is -1.0: expected 0 or more"),
-        ("gail.updates", 0, "gail.updates is 0: expected more than 0"),
-        ("pwil.scale", 0.0, "pwil.scale is 0.0: expected more than 0"),
+        ("smp.average", 1.0, "smp.average is 1.0: expected a number of at least 0 and below 1"),
+        ("wail.gradient_penalty", -1.0, "wail.gradient_penalty is -1.0: expected a number of at least 0"),
+        ("gail.updates", 0, "gail.updates is 0: expected a whole number of at least 1"),
+        ("pwil.scale", 0.0, "pwil.scale is 0.0: expected a number above 0"),
         ("pwil.slack", 0.1, "pwil.slack is 0.1: expected less than 0.00666667, the mass of one of the 150 steps"),
     ],
 )

@@ -1,0 +1,48 @@
+"""The numbers of the method that can be set, each once, with its source; and the presets.
+
+Numbers that cannot be set stand where they are used. They define a figure (at the top of `metrics` and `evaluate`), are
+part of a formula (in `env`, `ppo`, `features`, `transport`, `potential` and `priors`) or size a study (`experiments`).
+"""
+
+from fmpjax.config.presets import DESCRIPTIONS, PRESETS, preset
+from fmpjax.config.reading import flatten, from_json, read, to_json, validate, with_changes
+from fmpjax.config.sections import (
+    SMP_NETWORKS,
+    AdversaryConfig,
+    AMPConfig,
+    Config,
+    EnvConfig,
+    FeatureConfig,
+    GAILConfig,
+    PhysicsConfig,
+    PPOConfig,
+    PriorConfig,
+    PWILConfig,
+    SMPConfig,
+    WAILConfig,
+)
+
+__all__ = [
+    "DESCRIPTIONS",
+    "PRESETS",
+    "SMP_NETWORKS",
+    "AMPConfig",
+    "AdversaryConfig",
+    "Config",
+    "EnvConfig",
+    "FeatureConfig",
+    "GAILConfig",
+    "PPOConfig",
+    "PWILConfig",
+    "PhysicsConfig",
+    "PriorConfig",
+    "SMPConfig",
+    "WAILConfig",
+    "flatten",
+    "from_json",
+    "preset",
+    "read",
+    "to_json",
+    "validate",
+    "with_changes",
+]

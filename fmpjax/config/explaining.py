@@ -1,0 +1,122 @@
+"""Every setting explained, from where it is declared: for ``fmpjax settings`` and for docs/settings.md."""
+
+import dataclasses
+import difflib
+import functools
+import inspect
+import re
+import textwrap
+from collections.abc import Mapping
+from typing import Any
+
+from fmpjax.config.presets import DESCRIPTIONS, PRESETS, preset
+from fmpjax.config.reading import described, flatten, types
+from fmpjax.config.sections import SOURCES, Config, Section
+from fmpjax.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What there is to know about one setting."""
+
+    key: str
+    expected: str  # values that it takes, in words
+    meaning: str  # with unit and source
+    values: Mapping[str, Any]  # by preset
+
+
+@functools.cache
+def settings() -> Mapping[str, Setting]:
+    """All settings by key, in the order of the sections."""
+    presets = {name: flatten(preset(name)) for name in reversed(PRESETS)}
+    found = {}
+    for key in flatten(Config()):
+        section, _, field = key.rpartition(".")
+        owner = type(getattr(Config(), section)) if section else Config
+        values = {name: flat[key] for name, flat in presets.items()}
+        found[key] = Setting(key, described(types(owner)[field]), _comments(owner)[field], values)
+    return found
+
+
+def text(name: str = "") -> str:
+    """Settings for a terminal, of one section or one alone where it is named.
+
+    Raises:
+      UserError: there is no such section or setting.
+    """
+    chosen = [setting for key, setting in settings().items() if not name or key == name or key.startswith(f"{name}.")]
+    if not chosen:
+        close = difflib.get_close_matches(name, [*sections(), *settings()], n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"expected one of {', '.join(sections())}, or one setting"
+        raise UserError(f"unknown section {name!r}: {hint}")
+    blocks = [
+        f"{setting.key} = {_differing(setting)}\n    {setting.meaning}\n    {setting.expected}" for setting in chosen
+    ]
+    return "\n".join([*blocks, "", textwrap.fill(f"Sources: {_legend()}.", 100), ""])
+
+
+def markdown() -> str:
+    """The page docs/settings.md."""
+    lines = [
+        "# Settings",
+        "",
+        "`--set section.field=value` changes a setting, and `fmpjax settings [SECTION]` explains it. This page is what",
+        "`fmpjax settings --markdown` prints.",
+        "",
+        textwrap.fill(f"Letters in brackets name the source of a number: {_legend()}.", 120),
+        "",
+        *(f"- preset `{name}`: {words}" for name, words in DESCRIPTIONS.items()),
+    ]
+    for section, sentence in {"": "The run itself.", **sections()}.items():
+        names = " | ".join(reversed(PRESETS))
+        lines += ["", f"## {section or 'run'}", "", sentence, "", f"| setting | {names} | meaning | values |"]
+        lines += ["|" + "---|" * (len(PRESETS) + 3)]
+        for setting in settings().values():
+            if setting.key.rpartition(".")[0] == section:
+                cells = [f"`{setting.key}`", *(f"`{_shown(value)}`" for value in setting.values.values())]
+                cells += [setting.meaning, setting.expected]
+                lines.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def sections() -> Mapping[str, str]:
+    """The sections by name, each with the first sentence of what it is."""
+    found = {field.name: getattr(Config(), field.name) for field in dataclasses.fields(Config)}
+    return {name: type(value).__doc__ for name, value in found.items() if isinstance(value, Section)}
+
+
+def _comments(section: type) -> Mapping[str, str]:
+    """The comment of each field, behind it or right above it."""
+    found = {}
+    for owner in reversed(section.__mro__):
+        if not dataclasses.is_dataclass(owner):
+            continue
+        above = []
+        for line in inspect.getsource(owner).splitlines():
+            code, _, comment = line.partition("# ")
+            if field := re.match(r"    (\w+): ", code):
+                found[field[1]] = comment or " ".join(above)
+            above = [*above, comment] if comment and not code.strip() else []
+    return found
+
+
+def _shown(value: Any) -> str:
+    """A value as `--set` takes it."""
+    if isinstance(value, tuple):
+        return ",".join(map(_shown, value))
+    return str(value).lower() if isinstance(value, bool) else str(value) or '""'
+
+
+def _differing(setting: Setting) -> str:
+    """The paper's value, and the presets that depart from it."""
+    (_, common), *others = setting.values.items()
+    differing: dict[str, list[str]] = {}
+    for name, value in others:
+        if value != common:
+            differing.setdefault(_shown(value), []).append(name)
+    departures = ", ".join(f"{value} in {' and '.join(names)}" for value, names in differing.items())
+    return _shown(common) + (f" ({departures})" if departures else "")
+
+
+def _legend() -> str:
+    return ", ".join(f"[{letter}] {source}" for letter, source in SOURCES.items())
