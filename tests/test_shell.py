@@ -12,7 +12,7 @@ import pytest
 
 import fmpjax
 from fmpjax import cli, config, experiments, motion, priors, robots
-from fmpjax.experiments import results
+from fmpjax.experiments.common import results
 
 ROOT = Path(fmpjax.__file__).parents[1]
 
