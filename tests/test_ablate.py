@@ -263,6 +263,7 @@ def test_falls_stand_at_every_size_of_noise_with_their_episodes():
     assert found[1]["falls, %"] == "12.6 (n = 1024)" and found[1]["at 0 rad, %"] == "–"
     assert found[2]["at 0.01 rad, %"] == found[2]["Sinkhorn"] == "–"
     assert found[2]["speed, m/s"] == "0.500 (1 start per seed)"
+    assert table._cell([new[0], old], table.COLUMNS[1]).endswith(" (n = 257)")
     now, before = table.notes([*new, old])
     assert "all other figures of starts with 0.001 rad (fixed reset)" in now and "do not compare" in before
     assert len(table.notes(new)) == len(table.notes([old])) == 1
