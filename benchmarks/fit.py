@@ -19,7 +19,7 @@ import optax
 
 from fmpjax import config, motion, priors, transport
 from fmpjax.config import PriorConfig
-from fmpjax.experiments.offline import product_flops, product_rate
+from fmpjax.experiments.common.offline import product_flops, product_rate
 from fmpjax.priors import flow
 from fmpjax.trainer import Trainer
 

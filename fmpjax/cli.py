@@ -12,7 +12,7 @@ import tyro
 
 import fmpjax
 from fmpjax import config as configuration
-from fmpjax import shell
+from fmpjax import experiments, machine, shell, tables
 from fmpjax.cli_deploy import Sim2Sim
 from fmpjax.cli_motion import MOTION
 from fmpjax.errors import UserError
@@ -345,15 +345,14 @@ class List:
             ("robots", {name: robots.load(name).description for name in robots.available()}),
             ("motions", {name: motion.describe(name) for name in motion.bundled()}),
         ):
-            width = max(map(len, described))
-            print("\n".join([f"{title}:", *(f"  {name:<{width}}  {text}" for name, text in described.items())]))
+            print(f"{title}:\n{tables.aligned(list(described.items()), texts=2)}")
 
 
 def _runs():
     """`fmpjax.runs`, imported when a command needs it."""
     import jax
 
-    from fmpjax import machine, runs
+    from fmpjax import runs
 
     machine.keep_compiled()
     try:
@@ -366,11 +365,20 @@ def _runs():
     return runs
 
 
+def _experiment(name: str, *options: str) -> None:
+    """Run a study; no other is imported."""
+    study = experiments.load(name)
+    machine.keep_compiled()
+    shell.parse(study, f"fmpjax experiment {name}", options)
+
+
+EXPERIMENT = shell.Group("Run a study of priors or runs, one per table or figure.", experiments.STUDIES)
 COMMANDS = shell.Group(
     "Flow-Matched Motion Priors in JAX. `fmpjax --version` prints the version.",
     {
         "train": Train, "evaluate": Evaluate, "diagnose": Diagnose, "render": Render, "export": Export,
-        "sim2sim": Sim2Sim, "report": Report, "motion": MOTION, "config": ShowConfig, "settings": Settings,
+        "sim2sim": Sim2Sim, "experiment": EXPERIMENT, "report": Report, "motion": MOTION, "config": ShowConfig,
+        "settings": Settings,
         "list": List,
     },
 )  # fmt: skip
@@ -378,9 +386,12 @@ COMMANDS = shell.Group(
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: bad input is one sentence and exit code 2."""
+    arguments = sys.argv[1:] if arguments is None else arguments
     with shell.ending():
-        if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+        if arguments == ["--version"]:
             print(f"fmpjax {fmpjax.__version__}")
+        elif arguments[:1] == ["experiment"] and len(arguments) > 1 and not arguments[1].startswith("-"):
+            _experiment(*arguments[1:])
         else:
             shell.parse(COMMANDS, "fmpjax", arguments)()
 

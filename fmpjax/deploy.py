@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import fmpjax
-from fmpjax import features, sim2sim
+from fmpjax import features, sim2sim, tables
 from fmpjax.config import Config
 from fmpjax.errors import UserError
 from fmpjax.motion import bundled
@@ -363,7 +363,7 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
         meaning = _MEANING[name].format(points=", ".join(robot.key_point_names))
         if name == "joint_rotation_6d" and robot.jointless_row is not None:
             meaning += f", with a row that is always 1, 0, 0, 0, 0, 1 before joint {robot.jointless_row}"
-        rows.append(f"| {start} | {start + width - 1} | `{name}` | {meaning} |")
+        rows.append(tables.row((str(start), str(start + width - 1), f"`{name}`", meaning)))
         start += width
     numbers = zip(
         policy.center, policy.scale, policy.low, policy.high, robot.stiffness, robot.damping, robot.effort, strict=True
@@ -381,14 +381,14 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
         transitions=config.transitions,
         reset=config.env.reset,
         physics_rate=1.0 / config.physics.timestep,
-        motions="\n".join(f"| {Path(name).name} | {weight:g} | {_license(name)} |" for name, weight in origin.motions),
+        motions="\n".join(tables.row((Path(name).name, f"{w:g}", _license(name))) for name, w in origin.motions),
         evaluation=_evaluated(origin.evaluation),
         robustness=_robustness(origin.evaluation),
         size=start,
         observation="\n".join(rows),
         joints=len(policy.joint_names),
         actions="\n".join(
-            f"| `{joint}` | " + " | ".join(f"{number:.6g}" for number in row) + " |"
+            tables.row((f"`{joint}`", *(f"{number:.6g}" for number in row)))
             for joint, row in zip(policy.joint_names, numbers, strict=True)
         ),
     )
@@ -413,7 +413,7 @@ def _evaluated(figures: dict[str, Any] | None) -> str:
 
 def _robustness(figures: dict[str, Any] | None) -> str:
     starts = (figures or {}).get("starts") or []
-    rows = [f"| {start['noise']:g} | {start['falls']} | {start['episodes']} |" for start in starts]
+    rows = [tables.row((f"{start['noise']:g}", str(start["falls"]), str(start["episodes"]))) for start in starts]
     if not rows:
         return "No disturbance was tried on this policy."
     return "\n".join(

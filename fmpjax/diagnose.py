@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from fmpjax import config as configuration
+from fmpjax import tables
 from fmpjax.config import Config
 from fmpjax.errors import UserError
 from fmpjax.logs import MetricsLog
@@ -634,5 +635,5 @@ def page() -> str:
         figure = rule.figure + (f", where {rule.when}" if rule.when else "")
         figure += f" (`{'`, `'.join(rule.methods)}`)" if rule.methods else ""
         look = ", ".join(f"`{key}`" for key in rule.look)
-        lines.append(f"| {rule.name} | {figure} | {rule.healthy} | {look} | {rule.evidence} |")
+        lines.append(tables.row((rule.name, figure, rule.healthy, look, rule.evidence)))
     return "\n".join(lines)

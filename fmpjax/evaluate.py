@@ -11,7 +11,7 @@ import numpy as np
 from ott.geometry import geometry
 from ott.tools import sinkhorn_divergence
 
-from fmpjax import features, jsons, kinematics, metrics, rotations, transport
+from fmpjax import features, jsons, kinematics, metrics, rotations, tables, transport
 from fmpjax.config import Config, FeatureConfig
 from fmpjax.env import EnvState
 from fmpjax.motion import MotionClip
@@ -369,4 +369,4 @@ def table(evaluation: Evaluation) -> str:
         )
         for share in e.motions
     ]
-    return "\n".join(f"  {name:<36} {value:>20}  {unit}".rstrip() for name, value, unit in rows)
+    return tables.lines("  {:<36} {:>20}  {}", rows)

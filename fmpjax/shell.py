@@ -20,7 +20,7 @@ class Group:
     """Commands under one name."""
 
     sentence: str  # what they are for
-    commands: Mapping[str, Any]  # a class, a function or another group each
+    commands: Mapping[str, Any]  # a class, a function, another group, or the sentence of one that is parsed elsewhere
 
 
 def default(text: object) -> Any:
@@ -41,6 +41,8 @@ def _union(group: Group) -> Any:
     for name, command in group.commands.items():
         if isinstance(command, Group):
             branch = tyro.conf.subcommand(name, constructor=_union(command), description=command.sentence)
+        elif isinstance(command, str):
+            branch = tyro.conf.subcommand(name, constructor=lambda: None, description=command)
         else:
             branch = tyro.conf.subcommand(name, constructor=command)
         branches.append(Annotated[Any, branch])

@@ -107,6 +107,10 @@ def test_unknown_preset(refused, command):
     assert "unknown preset 'nope': expected one of smoke, laptop, paper" in refused(*command)
 
 
+def test_unknown_experiment(refused):
+    assert "unknown experiment 'nope': expected one of ablate, barycenter, curvature" in refused("experiment", "nope")
+
+
 # --- motion files ----------------------------------------------------------------------------------------------------
 
 

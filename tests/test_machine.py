@@ -43,7 +43,7 @@ def test_no_call_is_of_one_system_alone(tmp_path):
         _BARE
         + f"""
 from fmpjax import config, machine, physics, robots, runs
-from fmpjax.experiments import cells
+from fmpjax.experiments.common import cells
 print(machine.cores(), physics.make(robots.load("strider"), config.preset("smoke").physics).threads)
 print(runs.provenance()["cores"], runs.machine(), cells._shares(2))
 folder = runs.Run({str(tmp_path)!r})

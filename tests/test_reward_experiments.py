@@ -14,18 +14,8 @@ from test_train import tiny
 from fmpjax import cli, potential, priors, runs, transport
 from fmpjax.config import Config, PriorConfig
 from fmpjax.errors import UserError
-from fmpjax.experiments import (
-    barycenter,
-    curvature,
-    generalization,
-    histories,
-    offline,
-    reference,
-    report,
-    results,
-    static_teacher,
-    table,
-)
+from fmpjax.experiments import barycenter, curvature, generalization, report, static_teacher
+from fmpjax.experiments.common import histories, offline, reference, results, table
 from fmpjax.priors import flow
 from fmpjax.trainer import Trainer
 

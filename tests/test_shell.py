@@ -12,7 +12,7 @@ import pytest
 
 import fmpjax
 from fmpjax import cli, config, experiments, motion, priors, robots
-from fmpjax.experiments import results
+from fmpjax.experiments.common import results
 
 ROOT = Path(fmpjax.__file__).parents[1]
 
@@ -67,6 +67,23 @@ def test_every_command_has_a_sentence_and_no_default_is_none(shown, program):
     assert "Union" not in "".join(sentences.values())
     if program == "fmpjax":
         assert ("motion", "check") in sentences and len(sentences) > 14
+
+
+def test_every_study_is_listed_by_the_sentence_of_its_own_help(shown):
+    assert list(experiments.STUDIES) == [name for name, _ in _experiments()]
+    listed = " ".join(re.sub("[│\n]", " ", shown("fmpjax", "experiment", "--help")).split())
+    for name, sentence in experiments.STUDIES.items():
+        assert f" {name} {sentence}" in listed
+        usage, own, _ = shown("fmpjax", "experiment", name, "--help").split("\n\n", 2)
+        assert usage.startswith(f"usage: fmpjax experiment {name} ")
+        assert " ".join(own.split()) == sentence
+
+
+def test_the_list_of_studies_imports_none_of_them():
+    """In a process of its own: here they are imported."""
+    looked = "from fmpjax import cli\ntry: cli.main(['experiment', '--help'])\nexcept SystemExit: pass\nimport sys\n"
+    looked += "print([name for name in sys.modules if name.startswith('fmpjax.experiments.')])"
+    assert _process("-c", looked, stdout=subprocess.PIPE).communicate(timeout=120)[0].endswith("\n[]\n")
 
 
 def test_help_names_the_defaults_of_training(shown):

@@ -1,6 +1,6 @@
 """The matched comparison: every method with every reset and seed, Table I and the learning curves from our own runs.
 
-``python -m fmpjax.experiments.ablate --out runs/table1`` plans the cells, runs what is missing, and writes the results.
+``fmpjax experiment ablate --out runs/table1`` plans the cells, runs what is missing, and writes the results.
 """
 
 import dataclasses
@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from fmpjax.experiments import cells, results, table
-from fmpjax.experiments.cells import Cell, Specification
+from fmpjax.experiments.common import cells, results, table
+from fmpjax.experiments.common.cells import Cell, Specification
 from fmpjax.shell import default
 
 
@@ -29,7 +29,7 @@ def main(
     together: bool = False,
     video: bool = False,
 ) -> None:
-    """Run the matched comparison; started again, it goes on where it was.
+    """Run the matched comparison, and continue it when it is started again.
 
     Args:
       out: folder of the cells' runs and of the results.
@@ -45,6 +45,8 @@ def main(
       together: train all seeds of a method and reset as one program, which pays on an accelerator.
       video: film the final policies of each reset's first seed side by side.
     """
+    # An exception, so that who ends the comparison ends its cells, which save.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     specification = cells.read_specification(spec) if spec else Specification()
     named = {
         "preset": preset, "motion": motion, "frames": frames, "transitions": transitions,
@@ -88,9 +90,7 @@ def films(planned: Sequence[Cell], folder: Path, seconds: float = 10.0) -> list[
 
 
 def cli(arguments: Sequence[str] | None = None) -> None:
-    """Entry point."""
-    # An exception, so that who ends the comparison ends its cells, which save.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    """Entry point of ``python -m fmpjax.experiments.ablate``."""
     results.entry(main, arguments)
 
 

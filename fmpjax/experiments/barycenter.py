@@ -2,7 +2,7 @@
 
 The barycentric baseline's targets in the first rollout of an untrained policy, under either reset: how much of the
 legs' velocity the average keeps, how many expert windows it is over, how fast it goes. A draw is one seed's policy,
-starts and banks; figures are means over draws. Run as ``python -m fmpjax.experiments.barycenter --out FOLDER``.
+starts and banks; figures are means over draws. Run as ``fmpjax experiment barycenter --out FOLDER``.
 """
 
 import dataclasses
@@ -15,11 +15,13 @@ import numpy as np
 
 from fmpjax import config as configuration
 from fmpjax import priors
+from fmpjax.config import Config
 from fmpjax.errors import UserError
-from fmpjax.experiments import results
-from fmpjax.experiments.results import Table, Verdict, number
+from fmpjax.experiments.common import results
+from fmpjax.experiments.common.results import Table, Verdict, number
 from fmpjax.features import FeatureMap
 from fmpjax.frames import PLANAR, FrameLayout
+from fmpjax.motion import MotionLibrary
 from fmpjax.priors.barycentric import BarycentricState
 from fmpjax.shell import default
 from fmpjax.trainer import Trainer
@@ -247,6 +249,25 @@ def figure(record: Mapping[str, Any], path: Path) -> Path:
     )
 
 
+def _under_resets(
+    base: Config, clip: MotionLibrary, targets: int, seeds: Sequence[int], fractions: Sequence[float]
+) -> tuple[dict[float, dict[str, Any]], list[dict[str, Any]]]:
+    """Figures over the draws, by entropy and reset; and those of each draw, lines of the CSV file."""
+    found: dict[float, dict[str, Any]] = {fraction: {} for fraction in fractions}
+    scalars = []
+    for reset in RESETS:
+        print(f"first rollouts, {reset} reset ...", flush=True)
+        config = dataclasses.replace(base, env=dataclasses.replace(base.env, reset=reset))
+        for fraction, each in measure(Trainer(config, clip), targets, seeds, fractions).items():
+            found[fraction][reset] = over_draws(each)
+            scalars += [
+                {"reset": reset, "entropy": fraction, "seed": seed}
+                | {k: v for k, v in figures.items() if not isinstance(v, list)}
+                for seed, figures in zip(seeds, each, strict=True)
+            ]
+    return found, scalars
+
+
 def main(
     out: Path,
     preset: str = "paper",
@@ -257,7 +278,7 @@ def main(
     entropies: tuple[float, ...] = (0.12, 0.15),
     smoke: bool = False,
 ) -> None:
-    """Reconstruct the barycentric baseline's first targets under either reset.
+    """Measure what the barycentric baseline's first targets keep of the motion.
 
     Args:
       out: folder for barycenter.json, .csv and .png.
@@ -284,19 +305,7 @@ def main(
     clip = runs.load_motion(base)
     own = base.prior.epsilon_fraction
     fractions = list(dict.fromkeys([own, *entropies]))
-    found: dict[float, dict[str, Any]] = {fraction: {} for fraction in fractions}
-    scalars = []
-    for reset in RESETS:
-        print(f"first rollouts, {reset} reset ...", flush=True)
-        config = dataclasses.replace(base, env=dataclasses.replace(base.env, reset=reset))
-        seeds = range(seed, seed + draws)
-        for fraction, each in measure(Trainer(config, clip), targets, seeds, fractions).items():
-            found[fraction][reset] = over_draws(each)
-            scalars += [
-                {"reset": reset, "entropy": fraction, "seed": drawn}
-                | {k: v for k, v in figures.items() if not isinstance(v, list)}
-                for drawn, figures in zip(seeds, each, strict=True)
-            ]
+    found, scalars = _under_resets(base, clip, targets, range(seed, seed + draws), fractions)
     settings = {
         "preset": preset, "motion": Path(motion).name, "frames": frames, "seed": seed, "draws": draws,
         "targets": targets, "entropy": own,

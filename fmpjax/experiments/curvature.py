@@ -2,7 +2,7 @@
 
 Two expert atoms at -a and a on a line, a source between them: halfway, the cross-potential curves by
 -1 + a^2 / epsilon, and rises to either side for every epsilon below a^2; the closeness to the atoms' mean falls to
-either side for every epsilon. Run as ``python -m fmpjax.experiments.curvature --out FOLDER``.
+either side for every epsilon. Run as ``fmpjax experiment curvature --out FOLDER``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from fmpjax import transport
-from fmpjax.experiments import results
-from fmpjax.experiments.results import Table, Verdict, number
+from fmpjax.experiments.common import results
+from fmpjax.experiments.common.results import Table, Verdict, number
 from fmpjax.viz import panels
 from fmpjax.viz.panels import Line, Panel
 
@@ -118,7 +118,7 @@ def figure(record: Mapping[str, Any], path: Path) -> Path:
 
 
 def main(out: Path) -> None:
-    """Compute both landscapes between two atoms, and check the curvature against its closed form.
+    """Compare the score and the barycentric reward halfway between two atoms.
 
     Args:
       out: folder for curvature.json, .csv and .png.

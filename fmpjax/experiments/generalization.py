@@ -2,16 +2,16 @@
 
 FMP, Endpoint and Value are fitted to the windows of a standing policy and compared with references that they never saw,
 also along rollout-to-expert paths (Fig. mechanism, a and b). Run as
-``python -m fmpjax.experiments.generalization --run STANDING --walking WALKING --out FOLDER``.
+``fmpjax experiment generalization --run STANDING --walking WALKING --out FOLDER``.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from fmpjax.experiments import offline, results
-from fmpjax.experiments.offline import GROUPS, Updates
-from fmpjax.experiments.results import Table, Verdict, number
+from fmpjax.experiments.common import offline, results
+from fmpjax.experiments.common.offline import GROUPS, Updates
+from fmpjax.experiments.common.results import Table, Verdict, number
 from fmpjax.viz import panels
 from fmpjax.viz.panels import Line, Panel
 
@@ -130,7 +130,7 @@ def figure(record: Mapping[str, Any], path: Path) -> Path:
 
 
 def main(run: Path, walking: Path, out: Path, updates: Updates = None, smoke: bool = False, seed: int = 0) -> None:
-    """Fit three priors to a standing policy's windows and see how they do beyond them.
+    """Fit FMP, Endpoint and Value to a standing policy's windows, and measure them beyond these.
 
     Args:
       run: folder of a run whose newest policy stands.

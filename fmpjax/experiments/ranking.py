@@ -2,7 +2,7 @@
 
 The prior is fitted to the windows of a fixed policy (an untrained one, or a run's) and then scores the demonstration
 and copies that are frozen, slowed, reversed, shuffled in time, and noisy. A reward is of use where the copies lose. Run
-as ``python -m fmpjax.experiments.ranking --run RUN`` or, for the start of training, with ``--start``.
+as ``fmpjax experiment ranking --run RUN`` or, for the start of training, with ``--start``.
 """
 
 import dataclasses
@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import features, jsons, priors
-from fmpjax.experiments import histories, results
+from fmpjax import features, jsons, priors, tables
+from fmpjax.experiments.common import histories, results
 from fmpjax.motion import MotionClip, resample
 from fmpjax.shell import default
 from fmpjax.trainer import Trainer
@@ -91,12 +91,12 @@ def rank(trainer: Trainer, windows: jax.Array, key: jax.Array, updates: int = 51
 
 def table(ranking: dict[str, dict[str, float]]) -> str:
     """The ranking for people."""
-    lines = [f"  {'windows':<26} {'reward':>7} {'margin':>8}  loses to the demonstration"]
-    lines += [
-        f"  {name:<26} {row['reward']:7.3f} {row['margin']:8.2f}  {100 * row['beaten']:5.1f} %"
+    rows = [
+        (name, f"{row['reward']:.3f}", f"{row['margin']:.2f}", f"{100 * row['beaten']:5.1f} %")
         for name, row in ranking.items()
     ]
-    return "\n".join(lines)
+    headings = ("windows", "reward", "margin", "loses to the demonstration")
+    return tables.lines("  {:<26} {:>7} {:>8}  {}", [headings, *rows])
 
 
 def main(
@@ -106,7 +106,7 @@ def main(
     updates: int = 512,
     out: Annotated[Path | None, default("RUN/ranking.json, or RUN/ranking-start.json with --start")] = None,
 ) -> None:
-    """Rank the demonstration and its copies under a reward fitted to a policy's windows.
+    """Rank the demonstration and spoiled copies of it under a reward fitted to a policy's windows.
 
     Args:
       run: folder of the run.

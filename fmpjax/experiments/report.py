@@ -15,8 +15,9 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from fmpjax.errors import UserError
-from fmpjax.experiments import barycenter, curvature, generalization, results, static_teacher, table
-from fmpjax.experiments.results import Table, Verdict
+from fmpjax.experiments import barycenter, curvature, generalization, static_teacher
+from fmpjax.experiments.common import results, table
+from fmpjax.experiments.common.results import Table, Verdict
 
 COMPARISON = "results.json"  # of the matched comparison
 VIDEO_LIMIT = 12_000_000  # bytes of all videos that a page holds; those beyond it are named instead
@@ -76,7 +77,7 @@ def _section(
     read: Callable[[dict[str, Any]], tuple[Table, list[Verdict]]],
 ) -> Section:
     """The section of the file called ``name`` that lies nearest below ``folder``, with the picture beside it."""
-    command = f"python -m fmpjax.experiments.{module}{needs} --out FOLDER"
+    command = f"fmpjax experiment {module}{needs} --out FOLDER"
     path = min(folder.rglob(name), key=lambda path: (len(path.parts), path), default=None)
     if path is None:
         return Section(title, None, (), None, None, {}, command)

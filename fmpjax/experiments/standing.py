@@ -3,7 +3,7 @@
 A policy is trained as `fmpjax train` would, and every so often it is halted and looked at: what its standing and its
 walking moments earn and how soon they end in a fall, how much of the policy gradient is about survival alone, how well
 the few updates of a rollout follow the transport they are fitted to, and which features carry the score. Run as
-``python -m fmpjax.experiments.standing measure --out FOLDER``; ``look --run RUN`` looks at a run's newest state only.
+``fmpjax experiment standing measure --out FOLDER``; ``look --run RUN`` looks at a run's newest state only.
 """
 
 import csv
@@ -21,7 +21,7 @@ import tyro
 from fmpjax import features, jsons, physics, potential, ppo, priors, runs
 from fmpjax.config import Config, preset
 from fmpjax.evaluate import Evaluator
-from fmpjax.experiments import reference, results
+from fmpjax.experiments.common import reference, results
 from fmpjax.frames import FrameLayout
 from fmpjax.priors import flow
 from fmpjax.priors.base import couple, median_reward

@@ -2,16 +2,16 @@
 
 FMP is fitted with dynamic labels, which cost nothing, and with static ones, for which a second bank is solved at every
 update, from the same parameters on the same points. Run as
-``python -m fmpjax.experiments.static_teacher --run STANDING --walking WALKING --out FOLDER``.
+``fmpjax experiment static_teacher --run STANDING --walking WALKING --out FOLDER``.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from fmpjax.experiments import offline, results
-from fmpjax.experiments.offline import GROUPS, Updates
-from fmpjax.experiments.results import Table, Verdict, number
+from fmpjax.experiments.common import offline, results
+from fmpjax.experiments.common.offline import GROUPS, Updates
+from fmpjax.experiments.common.results import Table, Verdict, number
 from fmpjax.viz import panels
 from fmpjax.viz.panels import Line, Panel
 
@@ -133,7 +133,7 @@ def figure(record: Mapping[str, Any], path: Path) -> Path:
 
 
 def main(run: Path, walking: Path, out: Path, updates: Updates = None, smoke: bool = False, seed: int = 0) -> None:
-    """Fit FMP with dynamic and with static path supervision, and see what either costs and gives.
+    """Fit FMP with dynamic and with static path supervision, and compare them.
 
     Args:
       run: folder of a run whose newest policy stands.

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from scipy.signal import savgol_filter
 
-from fmpjax import rotations
+from fmpjax import rotations, tables
 from fmpjax.motion.clip import MotionClip
 from fmpjax.motion.edit import loop_target
 from fmpjax.motion.soles import slides, sole_points
@@ -280,9 +280,5 @@ def _healthy(figure: Figure) -> str:
 
 def table(figures: list[Figure]) -> str:
     """The figures as lines of text: value, healthy range, verdict."""
-    lines = []
-    for figure in figures:
-        lines.append(
-            f"{figure.name:<19}{_value(figure):<20}{_healthy(figure):<12}{figure.verdict:<8}{figure.where}".rstrip()
-        )
-    return "\n".join([f"{'figure':<19}{'value':<20}{'healthy':<12}verdict", *lines])
+    rows = [(f.name, _value(f), _healthy(f), f.verdict, f.where) for f in figures]
+    return tables.lines("{:<19}{:<20}{:<12}{:<8}{}", [("figure", "value", "healthy", "verdict", ""), *rows])

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fmpjax import rotations
+from fmpjax import rotations, tables
 
 
 class Fact(NamedTuple):
@@ -25,8 +25,8 @@ class Reading(NamedTuple):
 
     def __str__(self) -> str:
         """One line per fact, then one per warning."""
-        lines = [f"  {fact.what:<12}{fact.value:<32}{fact.why}".rstrip() for fact in self.facts]
-        return "\n".join([*lines, *(f"  warning: {warning}" for warning in self.warnings)])
+        facts = [tables.lines("  {:<12}{:<32}{}", self.facts)] if self.facts else []
+        return "\n".join([*facts, *(f"  warning: {warning}" for warning in self.warnings)])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import binary_dilation, uniform_filter1d
 
-from fmpjax import rotations
+from fmpjax import rotations, tables
 from fmpjax.errors import UserError
 from fmpjax.motion import check
 from fmpjax.motion.clip import MotionClip
@@ -140,12 +140,15 @@ def _measured(robot: Robot, clip: MotionClip, first: int, last: int, kind: str, 
 
 def table(clip: MotionClip, found: list[Stretch], kind: np.ndarray) -> str:
     """The stretches as lines of text, and what of the clip is in none."""
-    lines = [f"{'rows':<16}{'seconds':<9}{'kind':<10}{'m/s':<7}{'rad/s':<8}verdict"]
-    for s in found:
-        lines.append(
-            f"{f'{s.first}:{s.last}':<16}{(s.last - s.first) / clip.rate:<9.1f}{s.kind:<10}{s.speed:<7.2f}"
-            f"{s.turning:<8.2f}{s.verdict:<8}{s.fault}".rstrip()
+    rows = [
+        (
+            f"{s.first}:{s.last}", f"{(s.last - s.first) / clip.rate:.1f}", s.kind, f"{s.speed:.2f}",
+            f"{s.turning:.2f}", s.verdict, s.fault,
         )
+        for s in found
+    ]  # fmt: skip
+    headings = ("rows", "seconds", "kind", "m/s", "rad/s", "verdict", "")
+    lines = [tables.lines("{:<16}{:<9}{:<10}{:<7}{:<8}{:<8}{}", [headings, *rows])]
     inside = sum(s.last - s.first + 1 for s in found) / clip.rate
     down, broken = (float(np.count_nonzero(kind == k)) / clip.rate for k in (DOWN, BROKEN))
     rest = len(clip) / clip.rate - inside - down - broken

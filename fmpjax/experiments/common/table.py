@@ -12,9 +12,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy import stats
 
-from fmpjax.experiments import results
-from fmpjax.experiments.cells import Cell
-from fmpjax.experiments.results import Verdict
+from fmpjax import tables
+from fmpjax.experiments.common import results
+from fmpjax.experiments.common.cells import Cell
+from fmpjax.experiments.common.results import Verdict
 from fmpjax.logs import MetricsLog
 from fmpjax.motion import library
 
@@ -65,6 +66,7 @@ _PAPER = {
     ("fixed", "amp"): (500.0, 0, 0.000, 0.027, 39.24, 0.424, 64),
     ("fixed", "barycentric"): (500.0, 0, 0.000, 0.144, 35.15, 0.557, 64),
 }
+_PAPERS = ""  # cell of the paper's figures
 _SIZED = "falls_at_"  # and the size of the perturbation at the start, rad
 
 
@@ -89,6 +91,12 @@ class Row:
     def figure(self, name: str) -> float:
         """One of the figures; NaN where the evaluation, of an earlier version, has no such one."""
         return self.figures.get(name, math.nan)
+
+    @property
+    def alike(self) -> bool:
+        """Whether all episodes are one: our earlier versions did not perturb the fixed pose from which they start."""
+        perturbed = any(math.isfinite(v) for k, v in self.figures.items() if k == "noise" or k.startswith(_SIZED))
+        return self.cell != _PAPERS and self.reset == "fixed" and not perturbed
 
 
 def evaluations(cell: Cell, folder: Path) -> list[Row]:
@@ -140,7 +148,7 @@ def _paper(reset: str, method: str) -> Row:
         "mean_length": length, "falls": 100.0 * falls / _EPISODES, "episodes": _EPISODES, "late_speed": speed,
         "late_n": late, "excursion": excursion, "amplitude_mae": mae, "discrepancy": discrepancy,
     }  # fmt: skip
-    return Row("", method, reset, "", 0, 50_003_968, math.nan, figures)
+    return Row(_PAPERS, method, reset, "", 0, 50_003_968, math.nan, figures)
 
 
 def _sizes(rows: Iterable[Row]) -> list[float]:
@@ -173,30 +181,19 @@ def _cell(rows: Sequence[Row], column: Column) -> str:
     defined = [row for row, value in zip(rows, values, strict=True) if math.isfinite(value)]
     counts = [row.figure(column.episodes) for row in defined] if column.episodes else []
     if counts and all(map(math.isfinite, counts)):
-        text += f" (n = {sum(counts):.0f})"
+        starts = sum(1 if row.alike else count for row, count in zip(defined, counts, strict=True))
+        text += " (1 start per seed)" if all(row.alike for row in defined) else f" (n = {starts:.0f})"
     return text + (f" ({len(defined)} of {len(rows)})" if 0 < len(defined) < len(rows) else "")
 
 
 def markdown(final: Sequence[Row]) -> str:
     """Table I in Markdown."""
-    headings, body = lines(final)
-    rule = ["---", "---", *["---:"] * (len(headings) - 2)]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (headings, rule, *body))
+    return tables.markdown(*lines(final), texts=2)
 
 
 def latex(final: Sequence[Row]) -> str:
-    """Table I in LaTeX (booktabs)."""
-    headings, rows = lines(final)
-
-    def line(cells):
-        escaped = (
-            c.replace("%", r"\%").replace("°", r"$^\circ$").replace("±", r"$\pm$").replace("–", "--") for c in cells
-        )
-        return " & ".join(escaped) + r" \\"
-
-    body = [line(headings), r"\midrule", *map(line, rows)]
-    columns = "ll" + "r" * (len(headings) - 2)
-    return "\n".join([rf"\begin{{tabular}}{{{columns}}}", r"\toprule", *body, r"\bottomrule", r"\end{tabular}"])
+    """Table I in LaTeX."""
+    return tables.latex(*lines(final), texts=2)
 
 
 def curves(rows: Sequence[Row], paths: Sequence[Path]) -> None:

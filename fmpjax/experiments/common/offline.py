@@ -19,8 +19,8 @@ import numpy as np
 from fmpjax import potential, priors
 from fmpjax.config import Config, PriorConfig
 from fmpjax.errors import UserError
-from fmpjax.experiments import histories
-from fmpjax.experiments.reference import Reference, centred_error, correlation, cosine, reference, spread
+from fmpjax.experiments.common import histories
+from fmpjax.experiments.common.reference import Reference, centred_error, correlation, cosine, reference, spread
 from fmpjax.logs import Progress, clock
 from fmpjax.priors import flow
 from fmpjax.shell import default
@@ -221,6 +221,65 @@ def paths(pool, expert, source, dimension, config: PriorConfig, key) -> list[jax
     return [source + fraction * (target - source) for fraction in FRACTIONS]
 
 
+class _Played(NamedTuple):
+    """What the two policies of a study executed."""
+
+    pool: histories.Pool  # of the standing policy
+    still: histories.Cohort  # soon after a reset, of the standing policy
+    moving: histories.Cohort  # likewise, of the walking one
+    told: dict[str, Any]  # how far the policies were trained, their speeds and the cohorts' sizes
+
+
+def _play(run: Path, walking: Path, size: Size, keys: Sequence[jax.Array]) -> tuple[Trainer, _Played]:
+    """The standing run's parts, and the windows that both policies execute."""
+    trainer, state = histories.policy(run, best=False)
+    walker, walker_state = histories.policy(walking, best=True)
+    _check_alike(run, trainer, walking, walker)
+    print(f"playing {size.environments} environments of {run}, and {walking} ...", flush=True)
+    still = histories.soon_after_reset(trainer, state.ppo, trainer.feature_map, keys[0], size.cohort, "standing")
+    moving = histories.soon_after_reset(walker, walker_state.ppo, trainer.feature_map, keys[1], size.cohort, "walking")
+    pool = histories.pool(trainer, state.ppo, trainer.feature_map, keys[2], count=size.environments)
+    told = {
+        "standing_transitions": int(state.iteration) * trainer.config.transitions_per_iteration,
+        "walking_transitions": int(walker_state.iteration) * walker.config.transitions_per_iteration,
+        "pool_speed": pool.speed, "standing_speed": still.speed, "walking_speed": moving.speed,
+        "standing": len(still.features), "walking": len(moving.features),
+    }  # fmt: skip
+    return trainer, _Played(pool, still, moving, told)
+
+
+def _measure(
+    trainer: Trainer, played: _Played, fits: Mapping[str, Fit], size: Size, keys: Sequence[jax.Array]
+) -> tuple[dict[str, dict[str, Any]], float]:
+    """Figures of every fit and of the second reference group, by name; and the time of both references, s."""
+    config, dimension = trainer.config.prior, trainer.feature_map.dimension
+    pool, still, moving = played.pool.features, played.still.features, played.moving.features
+    width = pool.shape[-1]
+    everything = pool.reshape(-1, width)
+    expert = trainer.expert.windows[next(iter(fits.values())).state.bank]
+    held_out = pool[:, int(QUERY_SHARE * size.environments) :].reshape(-1, width)
+    source = held_out[jax.random.choice(keys[0], len(held_out), (size.paths,), replace=False)]
+    points = paths(everything, expert, source, dimension, config, keys[1])
+    query = jnp.concatenate([held_out, *points, still, moving])
+    layout = lay_out(len(held_out), size.paths, len(still), len(moving))
+
+    print(f"two references of {size.banks} banks at {len(query):,} queries ...", flush=True)
+    refer = jax.jit(reference, static_argnames=("config", "banks"))
+    began = time.perf_counter()
+    truth, other = (
+        jax.block_until_ready(refer(everything, expert, query, dimension, config, key, size.banks))
+        for key in jax.random.split(keys[2])
+    )
+    seconds = time.perf_counter() - began
+    models: dict[str, dict[str, Any]] = {}
+    for name, fitted in fits.items():
+        candidate = Reference(*potential.score_and_gradient(fitted.state.average, query, dimension))
+        models[name] = agreement(candidate, truth, layout, config.spread_floor)
+        models[name] |= {"seconds": fitted.seconds, "unconverged": fitted.unconverged}
+    models[GROUPS] = agreement(other, truth, layout, config.spread_floor)
+    return models, seconds
+
+
 def study(run: Path, walking: Path, names: Sequence[str], size: Size, seed: int) -> dict[str, Any]:
     """Fit priors to a standing run's windows and measure all of them, and a second reference group, in the same way.
 
@@ -238,56 +297,22 @@ def study(run: Path, walking: Path, names: Sequence[str], size: Size, seed: int)
     Raises:
       UserError: a folder holds no policy, the runs do not belong together, or a cohort is empty.
     """
-    trainer, state = histories.policy(run, best=False)
-    walker, walker_state = histories.policy(walking, best=True)
-    _check_alike(run, trainer, walking, walker)
-    config, dimension = trainer.config.prior, trainer.feature_map.dimension
     keys = jax.random.split(jax.random.PRNGKey(seed), 7)
-    print(f"playing {size.environments} environments of {run}, and {walking} ...", flush=True)
-    still = histories.soon_after_reset(trainer, state.ppo, trainer.feature_map, keys[0], size.cohort, "standing")
-    moving = histories.soon_after_reset(walker, walker_state.ppo, trainer.feature_map, keys[1], size.cohort, "walking")
-    pool = histories.pool(trainer, state.ppo, trainer.feature_map, keys[2], count=size.environments)
+    trainer, played = _play(run, walking, size, keys[:3])
+    pool = played.pool
     print(f"fitting {', '.join(names)} to {pool.valid.size:,} windows, {pool.speed:.3f} m/s ...", flush=True)
     rollout = priors.Rollout(pool.features, pool.valid)
     fits, rate = fit(names, trainer.expert, trainer.config, rollout, size.updates, keys[3])
-
-    width = pool.features.shape[-1]
-    everything = pool.features.reshape(-1, width)
-    expert = trainer.expert.windows[fits[names[0]].state.bank]
-    held_out = pool.features[:, int(QUERY_SHARE * size.environments) :].reshape(-1, width)
-    source = held_out[jax.random.choice(keys[4], len(held_out), (size.paths,), replace=False)]
-    points = paths(everything, expert, source, dimension, config, keys[5])
-    query = jnp.concatenate([held_out, *points, still.features, moving.features])
-    layout = lay_out(len(held_out), size.paths, len(still.features), len(moving.features))
-
-    print(f"two references of {size.banks} banks at {len(query):,} queries ...", flush=True)
-    refer = jax.jit(reference, static_argnames=("config", "banks"))
-    began = time.perf_counter()
-    truth, other = (
-        jax.block_until_ready(refer(everything, expert, query, dimension, config, key, size.banks))
-        for key in jax.random.split(keys[6])
-    )
-    reference_seconds = time.perf_counter() - began
-    models: dict[str, dict[str, Any]] = {}
-    for name, fitted in fits.items():
-        candidate = Reference(*potential.score_and_gradient(fitted.state.average, query, dimension))
-        models[name] = agreement(candidate, truth, layout, config.spread_floor)
-        models[name] |= {"seconds": fitted.seconds, "unconverged": fitted.unconverged}
-        if name in COUNTED:
-            flops = sum(product_flops(config, width, static=name == "static").values())
-            models[name]["floor_seconds"] = size.updates * flops / rate
-    models[GROUPS] = agreement(other, truth, layout, config.spread_floor)
+    models, reference_seconds = _measure(trainer, played, fits, size, keys[4:])
+    for name in set(names) & set(COUNTED):
+        flops = product_flops(trainer.config.prior, pool.features.shape[-1], static=name == "static")
+        models[name]["floor_seconds"] = size.updates * sum(flops.values()) / rate
+    config = trainer.config
     return {
         "settings": dataclasses.asdict(size) | {
-            "seed": seed, "preset": trainer.config.preset, "motion": Path(trainer.config.motion).name,
-            "frames": trainer.config.frames,
+            "seed": seed, "preset": config.preset, "motion": Path(config.motion).name, "frames": config.frames,
         },
-        "policies": {
-            "standing_transitions": int(state.iteration) * trainer.config.transitions_per_iteration,
-            "walking_transitions": int(walker_state.iteration) * walker.config.transitions_per_iteration,
-            "pool_speed": pool.speed, "standing_speed": still.speed, "walking_speed": moving.speed,
-            "standing": len(still.features), "walking": len(moving.features),
-        },
+        "policies": played.told,
         "product_rate": rate,
         "reference_seconds": reference_seconds,
         "fractions": FRACTIONS,

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fmpjax import jsons, machine, shell
+from fmpjax import jsons, machine, shell, tables
 from fmpjax.errors import UserError
 from fmpjax.shell import Group
 
@@ -38,20 +38,12 @@ def number(value: float | None, digits: int = 3) -> str:
 
 def text(table: Table) -> str:
     """The table in columns of a terminal."""
-    rows = [table.headings, *table.lines]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(table.headings))]
-    line = lambda row: "  ".join(  # noqa: E731
-        cell.ljust(width) if i == 0 else cell.rjust(width)
-        for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-    )
-    return "\n".join([table.caption, *("  " + line(row) for row in rows)])
+    return f"{table.caption}\n{tables.aligned([table.headings, *table.lines])}"
 
 
 def markdown(table: Table) -> str:
     """The table in Markdown, its caption above."""
-    rule = ["---", *["---:"] * (len(table.headings) - 1)]
-    lines = ("| " + " | ".join(cells) + " |" for cells in (table.headings, rule, *table.lines))
-    return "\n".join([f"*{table.caption}*", "", *lines])
+    return f"*{table.caption}*\n\n{tables.markdown(table.headings, table.lines)}"
 
 
 def check_folder(out: Path) -> None:
