@@ -80,14 +80,7 @@ def retarget(
     if count < 2:
         raise UserError(f"{name}: the motion has {count} frame at {rate:g} Hz, expected at least two")
     joint = joints(source, name, skeleton)
-    poses = bvh.joint_poses(source._replace(values=values))
-    told, up = up, up or landmarks.up_axis(poses.position, joint, name)
-    axes = list(AXES[up])
-    position = {part: poses.position[:, j][:, axes] for part, j in joint.items()}
-    rotation_wxyz = {part: poses.rotation_wxyz[:, j][:, [0, *(1 + a for a in axes)]] for part, j in joint.items()}
-    for a, b in landmarks.segments():
-        if not np.linalg.norm(position[a] - position[b], axis=-1).min() > 0:
-            raise UserError(f"{name}: the skeleton's {a} and {b} are at one place, expected a distance")
+    axis, position, rotation_wxyz = _landmark_poses(source._replace(values=values), joint, up, name)
     rest = rest_positions(robot)
     scale = leg_length(rest) / leg_length(position)
     reach = scale * max(float(np.abs(p).max()) for p in position.values())
@@ -106,7 +99,7 @@ def retarget(
     facts = (
         Fact("robot", robot.name, "--robot"),
         _skeleton_fact(source, joint, told=bool(skeleton)),
-        Fact("up", up, "--up" if told else "hips are over ankles along it"),
+        Fact("up", axis, "--up" if up else "hips are over ankles along it"),
         Fact("size", f"{scale:.4g} m per unit", "legs as long as the robot's"),
         Fact("rate", f"{rate:g} Hz", f"the file's {source.rate:g} Hz{thinned}"),
     )
@@ -122,6 +115,19 @@ def _check_landmarks(robot: Robot) -> None:
         raise UserError(
             f"robot {robot.name!r} has no landmark {missing[0]!r} in its robot.toml, which retargeting needs"
         )
+
+
+def _landmark_poses(source: Bvh, joint: dict[str, int], up: str | None, name: str) -> tuple[str, dict, dict]:
+    """The axis that is up, and positions ``[T, 3]`` and orientations ``[T, 4]`` of landmarks in the robot's axes."""
+    poses = bvh.joint_poses(source)
+    up = up or landmarks.up_axis(poses.position, joint, name)
+    axes = list(AXES[up])
+    position = {part: poses.position[:, j][:, axes] for part, j in joint.items()}
+    rotation_wxyz = {part: poses.rotation_wxyz[:, j][:, [0, *(1 + a for a in axes)]] for part, j in joint.items()}
+    for a, b in landmarks.segments():
+        if not np.linalg.norm(position[a] - position[b], axis=-1).min() > 0:
+            raise UserError(f"{name}: the skeleton's {a} and {b} are at one place, expected a distance")
+    return up, position, rotation_wxyz
 
 
 def _skeleton_fact(source: Bvh, joint: dict[str, int], *, told: bool) -> Fact:
