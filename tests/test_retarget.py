@@ -193,7 +193,7 @@ def test_swinging_foot_clears_the_floor(robot):
     stands = np.zeros(frames, bool)
     stands[[0, 1, -2, -1]] = True
     path = feet.planted(robot, "left", free, np.tile(IDENTITY, (frames, 1)), stands, 30.0)
-    height = path[:, 2] + feet.lowest(robot, "left", IDENTITY)
+    height = path[:, 2] + feet.sole_height(robot, "left", IDENTITY)
     np.testing.assert_allclose(height[stands], 0, atol=1e-12)
     np.testing.assert_allclose(height[4:-4], feet.CLEARANCE, atol=1e-12)
     np.testing.assert_allclose(height[2], feet.CLEARANCE / 3, atol=1e-12)

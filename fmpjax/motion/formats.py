@@ -103,7 +103,7 @@ def record(
     file = locate(path, robot)
     recording = readers.read(file, loaded, Options(fps, quaternion, words, degrees))
     rows = cut(file, recording.qpos, frames)
-    if len(rows) == len(recording.qpos):
+    if frames is None or len(rows) == len(recording.qpos):
         return file, recording
     first, last = span(frames, len(recording.qpos))
     fact = Fact("rows", f"{first} to {last} of {len(recording.qpos)}", "--frames")

@@ -7,7 +7,7 @@ from fmpjax.errors import UserError
 from fmpjax.priors import amp, barycentric, empirical, flow, gail, pwil, smp, wail
 from fmpjax.priors.base import Expert, MotionPrior, Reward, Rollout, couple, median_reward
 
-_REGISTRY = {
+_REGISTRY: dict[str, Callable[[Expert, Config], MotionPrior]] = {
     "fmp": flow.make,
     "endpoint": flow.make_endpoint,
     "value": flow.make_value,

@@ -38,7 +38,8 @@ def course(legs: Sequence[str]) -> Course:
             numbers = []
         if len(numbers) != 4 or not np.isfinite(numbers).all() or numbers[0] <= 0:
             raise UserError(f"leg {leg!r} of the course: expected SECONDS:FORWARD,LEFT,TURN such as 4:0.5,0,0.4")
-        found.append((numbers[0], tuple(numbers[1:])))
+        leg_seconds, forward, left, turn = numbers
+        found.append((leg_seconds, (forward, left, turn)))
     return tuple(found)
 
 

@@ -7,7 +7,7 @@ import importlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import mujoco
 import numpy as np
@@ -67,7 +67,7 @@ class DriverError(Exception):
 
 
 @contextlib.contextmanager
-def drawing(name: str, robot: Robot, width: int, height: int, distance: float) -> Iterator[Picture]:
+def drawing(name: str, robot: Robot, width: int, height: int, distance: float) -> Generator[Picture]:
     """Draw with MuJoCo through the OpenGL platform ``name``."""
     model = copy.copy(robot.model)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height

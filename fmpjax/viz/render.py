@@ -139,7 +139,7 @@ def _camera_path(robot: Robot, root: np.ndarray, aspect: float, follow: bool) ->
     else:
         span = np.ptp(root, axis=0)
         centre = np.broadcast_to(root.min(0) + span / 2, root.shape)
-        distance = robot.view_distance * narrow + 1.2 * np.linalg.norm(span) / max(aspect, 1.0)
+        distance = robot.view_distance * narrow + 1.2 * float(np.linalg.norm(span)) / max(aspect, 1.0)
     return np.column_stack([centre, np.full(len(root), robot.view_height)]), distance
 
 
@@ -149,7 +149,7 @@ def _captioned(image: np.ndarray, text: str) -> np.ndarray:
     draw = ImageDraw.Draw(picture, "RGBA")
     size = max(10, image.shape[0] // 20)
     font, pad = ImageFont.load_default(size), size // 2
-    wide, tall = draw.textlength(text, font), sum(font.getmetrics())
+    wide, tall = draw.textlength(text, font), sum(font.getmetrics())  # ty: ignore[missing-union-attribute] - a font of a size is FreeType's
     draw.rounded_rectangle((pad, pad, 3 * pad + wide, 2 * pad + tall), pad, fill=(20, 26, 34, 170))
     draw.text((2 * pad, 1.5 * pad), text, font=font, fill=(255, 255, 255, 255))
     return np.asarray(picture)

@@ -1,7 +1,7 @@
 """Pictures of the robot as a plotted skeleton, where MuJoCo cannot draw."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import mujoco
 import numpy as np
@@ -20,7 +20,7 @@ PLOT_DPI = 100
 
 
 @contextlib.contextmanager
-def drawing(robot: Robot, width: int, height: int, distance: float) -> Iterator[Picture]:
+def drawing(robot: Robot, width: int, height: int, distance: float) -> Generator[Picture]:
     """Plot the bones as seen from the robot's right, a little from above."""
     figure = Figure((width / PLOT_DPI, height / PLOT_DPI), dpi=PLOT_DPI, facecolor="#f1f4f7")
     canvas = FigureCanvasAgg(figure)
@@ -31,7 +31,8 @@ def drawing(robot: Robot, width: int, height: int, distance: float) -> Iterator[
     points_per_metre = 72 * height / PLOT_DPI / tall
     size = robot.view_distance / 2.4  # the thickness of bones below is for this distance
     axes.axhspan(-tall, FLOOR_DEPTH * SHIFT[1], color="#dbe1e7", linewidth=0, zorder=0)
-    marks = axes.add_collection(LineCollection([], colors="#bcc6d0", linewidths=1, zorder=1))
+    marks = LineCollection([], colors="#bcc6d0", linewidths=1, zorder=1)
+    axes.add_collection(marks)
     bones = _Bones(robot)
 
     def picture(configurations: list[np.ndarray], look: np.ndarray) -> np.ndarray:
@@ -47,7 +48,7 @@ def drawing(robot: Robot, width: int, height: int, distance: float) -> Iterator[
             segments, balls = bones.project(qpos, look[1])
             drawn += [
                 LineCollection(
-                    segments,
+                    list(segments),
                     colors=tones[bones.tone],
                     linewidths=0.045 * size * points_per_metre,
                     capstyle="round",

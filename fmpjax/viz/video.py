@@ -2,7 +2,7 @@
 
 import contextlib
 import importlib
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +64,7 @@ def contact_sheet(path: str | Path, frames: np.ndarray, columns: int) -> Path:
 
 
 @contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
+def _writing(path: Path) -> Generator[None]:
     """Make the folder of ``path``; turn the system's refusal into a `UserError`."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -57,7 +57,7 @@ def sole(robot: Robot, side: str) -> tuple[np.ndarray, np.ndarray]:
     return robot.sole_point[own], robot.sole_radius[own]
 
 
-def lowest(robot: Robot, side: str, foot_wxyz: np.ndarray) -> np.ndarray:
+def sole_height(robot: Robot, side: str, foot_wxyz: np.ndarray) -> np.ndarray:
     """Height ``[...]`` (m) of the foot's lowest sole point over its ankle, for orientations ``[..., 4]``."""
     points, radius = sole(robot, side)
     return (rotations.rotate(foot_wxyz[..., None, :], points)[..., 2] - radius).min(axis=-1)
@@ -76,7 +76,7 @@ def planted(
     lowest = np.argmin(arm[1:, :, 2] + arm[:-1, :, 2] - 2 * radius, axis=-1)
     step = -(arm[1:] - arm[:-1])[np.arange(len(lowest)), lowest, :2]
     rolled = np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
-    floor = -lowest(robot, side, foot_wxyz)
+    floor = -sole_height(robot, side, foot_wxyz)
     correction = np.column_stack([rolled, floor]) - free
     edges = np.flatnonzero(np.diff(np.concatenate([[False], stands, [False]])))
     for first, end in edges.reshape(-1, 2):

@@ -109,7 +109,7 @@ def up_axis(position: np.ndarray, joint: dict[str, int], name: str) -> str:
     legs = sum(position[:, joint[f"{side}_hip"]] - position[:, joint[f"{side}_ankle"]] for side in SIDES)
     legs = legs / np.maximum(np.linalg.norm(legs, axis=-1, keepdims=True), 1e-9)
     along = {axis: float(np.median(legs[:, "xyz".index(axis)])) for axis in AXES}
-    up = max(along, key=along.get)
+    up = max(along, key=along.__getitem__)
     if along[up] < UPRIGHT:
         raise UserError(
             f"{name}: hips are over ankles neither along y nor along z in most frames, expected one of them to be up; "

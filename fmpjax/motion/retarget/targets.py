@@ -48,7 +48,7 @@ def targets_of(
     heel, toe, floor = feet.contacts(position, rate)
     middle = (position["left_hip"] + position["right_hip"]) / 2
     hips = (rest["left_hip"] + rest["right_hip"]) / 2
-    ankle_height = {side: -feet.lowest(robot, side, np.array([1.0, 0.0, 0.0, 0.0])) for side in SIDES}
+    ankle_height = {side: -feet.sole_height(robot, side, np.array([1.0, 0.0, 0.0, 0.0])) for side in SIDES}
     lift = np.array([0.0, 0.0, np.mean(list(ankle_height.values())) - floor["ankle"]])
     at = {"pelvis": middle + lift - rotations.rotate(turned["pelvis"], hips)}
     at["chest"] = at["pelvis"] + rotations.rotate(turned["pelvis"], rest["chest"])
