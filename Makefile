@@ -65,7 +65,7 @@ check: $(READY) ## lint, and check the formatting, the arrows between modules an
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache
-	$(BIN)/ty check --no-progress
+	$(BIN)/ty check --no-progress --python $(VENV)
 
 coverage: $(READY) ## the share of the lines that the fast tests run, file by file
 	$(BIN)/python -m pytest -m 'not slow' --cov fmpjax --cov-report term:skip-covered $(ARGS)
