@@ -30,6 +30,7 @@ known_evaluate := RUN ARGS
 known_render := RUN ARGS
 known_test := WORKERS ARGS
 known_test-fast := ARGS
+known_coverage := ARGS
 goals := $(or $(MAKECMDGOALS),$(.DEFAULT_GOAL))
 known := $(foreach goal,$(goals),$(known_$(goal))) PYTHON UV VENV
 given := $(foreach name,$(.VARIABLES),$(if $(filter command,$(firstword $(origin $(name)))),$(name)))
@@ -40,7 +41,7 @@ ifneq ($(unknown),)
   $(error unknown variable $(unknown)$(if $(close),$(comma) perhaps $(close)): make $(goals) takes $(strip $(known)))
 endif
 
-.PHONY: train evaluate render test test-fast check format build clean help run-is-named
+.PHONY: train evaluate render test test-fast coverage check format build clean help run-is-named
 
 train: $(READY) ## train a policy: METHOD RESET PRESET ROBOT MOTION FRAMES SEED SEEDS RUN MINUTES RESUME=1
 	$(BIN)/fmpjax train $(train_options)
@@ -60,9 +61,14 @@ test: $(READY) $(VENV)/.extras ## run every test, in WORKERS processes (2)
 test-fast: $(READY) ## run the tests that take seconds
 	$(BIN)/python -m pytest -m 'not slow' $(ARGS)
 
-check: $(READY) ## lint, and check the formatting
+check: $(READY) ## lint, and check the formatting, the arrows between modules and the types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache
+	$(BIN)/ty check --no-progress --python $(VENV)
+
+coverage: $(READY) ## the share of the lines that the fast tests run, file by file
+	$(BIN)/python -m pytest -m 'not slow' --cov fmpjax --cov-report term:skip-covered $(ARGS)
 
 format: $(READY) ## format, and fix what the linter can
 	$(BIN)/ruff check --fix-only .

@@ -128,17 +128,20 @@ def main() -> None:
         rates.append(rate())
         taken.append([1e3 * seconds(call) for call in pieces.values()])
     update, rate, taken = float(np.median(slopes)), float(np.median(rates)), np.median(taken, axis=0)
-
-    flops = product_flops(fitted, size)
-    floor = 1e3 * sum(flops.values()) / rate
     print(
         f"{fitted.minibatch} queries, banks of {fitted.bank}, d = {float(dimension):.0f} ({size} compact), Sinkhorn "
         f"{float(warm[2]['sinkhorn_iterations']):.0f} iterations, {float(warm[2]['unconverged']):.0f} not converged"
     )
+    show(dict(zip(pieces, taken, strict=True)), update, rate, product_flops(fitted, size))
+
+
+def show(parts: dict[str, float], update: float, rate: float, flops: dict[str, float]) -> None:
+    """Print the parts and the update (ms), and its floor at a rate of products (FLOP/s)."""
+    whole, floor = sum(parts.values()), 1e3 * sum(flops.values()) / rate
     print(f"{'part':<24}{'ms':>8}{'share':>8}")
-    for name, ms in zip(pieces, taken, strict=True):
-        print(f"{name:<24}{ms:>8.2f}{100 * ms / taken.sum():>7.0f}%")
-    print(f"{'sum of the parts':<24}{taken.sum():>8.2f}")
+    for name, ms in parts.items():
+        print(f"{name:<24}{ms:>8.2f}{100 * ms / whole:>7.0f}%")
+    print(f"{'sum of the parts':<24}{whole:>8.2f}")
     print(f"{'update, in the scan':<24}{update:>8.2f}   target {TARGET:.0f}: {'met' if update <= TARGET else 'missed'}")
     products = ", ".join(f"{name} {count / 1e9:.2f}" for name, count in flops.items())
     print(

@@ -48,7 +48,7 @@ class Sim2Sim:
         simulation = sim2sim.Simulation(policy, self.model, own_gains=self.gains == "model")
         played = sim2sim.play(simulation, seconds=self.seconds, episodes=self.episodes, course=course)
         print(sim2sim.report(simulation, played, course))
-        if robot is not None:
+        if robot is not None and self.video is not None:
             from fmpjax.viz import render
 
             frames = render.render_frames(robot, played[0].qpos[::2], labels="sim2sim")

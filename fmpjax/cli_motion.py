@@ -4,7 +4,7 @@ import dataclasses
 import math
 import sys
 from pathlib import Path
-from typing import Annotated, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import tyro
 
@@ -32,7 +32,7 @@ class Reading:
     degrees: bool = False
     """The file's joints are in degrees."""
 
-    def options(self) -> dict[str, object]:
+    def options(self) -> dict[str, Any]:
         """What `fmpjax.motion.load` is told."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(Reading)}
 
@@ -51,7 +51,7 @@ class Source(Reading):
         file, recording = formats.record(self.file, **self.options())
         if len(recording.qpos) < formats.LEAST_SAMPLES:
             raise UserError(f"{file}: {len(recording.qpos)} frames, expected at least {formats.LEAST_SAMPLES}")
-        clip = MotionClip.from_qpos(file.stem, self.robot, recording.rate, recording.qpos)
+        clip = MotionClip.from_qpos(file.stem, robots.load(self.robot).name, recording.rate, recording.qpos)
         clip = dataclasses.replace(clip, reading=recording.reading)
         return clip, check.flips(recording.qpos[:, 3:7])
 
@@ -147,7 +147,7 @@ class Check(Source):
         print(f"{self.file} was read as\n{clip.reading}\n\n{check.table(figures)}")
         for sentence in check.unsuited(robot, clip, axes=self.axes, reset=self.reset, seconds=self.seconds):
             print(f"\nnote: {sentence}")
-        if self.fix:
+        if self.out is not None:  # and --fix
             clip, changes = edit.fixed(robot, clip)
             changes += [f"{flips} flips of the quaternion taken out"] * bool(flips)
             print("\n".join(["", "fixed:", *(changes or ["nothing to change"]), ""]))

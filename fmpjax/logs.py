@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from tensorboardX import SummaryWriter
 
@@ -49,7 +50,7 @@ class MetricsLog:
 
     def write(self, iteration: int, transitions: int, seconds: float, values: Mapping[str, float]) -> None:
         """One row; what is missing or not a number stays empty."""
-        row = {"iteration": iteration, "transitions": transitions, "seconds": f"{seconds:.2f}"}
+        row: dict[str, Any] = {"iteration": iteration, "transitions": transitions, "seconds": f"{seconds:.2f}"}
         row |= {k: f"{v:.6g}" for k, v in values.items() if not math.isnan(v)}
         self.rows.append(row)
         if not self._keep:

@@ -32,7 +32,7 @@ def parts(config: Config, seeds: int = 1) -> dict[str, int]:
         # The gated layer's two halves, four times as wide. Scoring keeps no layer; pretraining keeps all, and slopes.
         needed["smp.score_batch"] = min(config.smp.score_batch, config.transitions_per_iteration) * 8 * layer
         needed["smp.batch"] = config.smp.batch * 36 * layers * layer
-        del needed[min(("smp.score_batch", "smp.batch"), key=needed.get)]  # one after the other
+        del needed[min(("smp.score_batch", "smp.batch"), key=needed.__getitem__)]  # one after the other
     elif section is None:  # a transport
         needed["prior.bank"] = 2 * 4 * prior.bank**2  # costs to another bank and to itself
     if config.method in ("fmp", "endpoint", "value"):
@@ -52,7 +52,7 @@ def check(config: Config, seeds: int = 1) -> None:
     has = machine.memory()
     if has is None or sum(needed.values()) <= has:
         return
-    largest = max(needed, key=needed.get)
+    largest = max(needed, key=needed.__getitem__)
     section, _, field = largest.partition(".")
     several = f", or --seeds (now {seeds})" if seeds > 1 else ""
     raise UserError(

@@ -34,6 +34,7 @@ class Robot:
     """
 
     name: str
+    path: Path  # of its robot.xml
     description: str  # what it is, in a line
     model: mujoco.MjModel
     joint_names: tuple[str, ...]
@@ -77,7 +78,7 @@ class Robot:
         Options are fields of ``model.opt``, e.g. ``timestep=0.01`` (s), and ``frictionloss`` (N m, every hinge).
         ``numerics`` are custom numbers of the model, which MJX reads.
         """
-        spec = mujoco.MjSpec.from_file(str(resources.folder("robots") / self.name / "robot.xml"))
+        spec = mujoco.MjSpec.from_file(str(self.path))
         for geom in [g for g in spec.geoms if g.group == _LOOKS]:
             spec.delete(geom)
         for name, value in numerics.items():
@@ -99,17 +100,41 @@ def available() -> list[str]:
     return sorted(p.parent.name for p in resources.folder("robots").glob("*/robot.xml"))
 
 
-@functools.cache
 def load(name: str) -> Robot:
-    """Load a shipped robot by its folder's name.
+    """Load a shipped robot by its folder's name, or another one by the path of its folder.
 
     Raises:
-      UserError: the name is unknown.
+      UserError: there is no such robot, or its files are not as docs/robots.md says.
     """
-    path = resources.folder("robots") / name / "robot.xml"
-    if name not in available():
-        raise UserError(f"unknown robot {name!r}: expected one of {', '.join(available())}")
-    return _read(name, path)
+    return _shipped(name) if name in available() else _from_folder(name)
+
+
+@functools.cache
+def _shipped(name: str) -> Robot:
+    return _read(name, resources.folder("robots") / name / "robot.xml")
+
+
+def _from_folder(name: str) -> Robot:
+    path = Path(name) / "robot.xml"
+    if not path.is_file():
+        known = ", ".join(available())
+        raise UserError(f"unknown robot {name!r}: expected one of {known}, or a folder with robot.xml and robot.toml")
+    own, facts = path.parent.resolve().name, path.with_suffix(".toml")
+    if own in available():
+        raise UserError(f"robot {name!r} is called {own!r} as a shipped one is: expected a folder of another name")
+    try:
+        return _read(own, path)
+    except UserError:
+        raise
+    except OSError as error:
+        raise UserError(f"cannot read {facts}: {error.strerror or error}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{facts} is not TOML ({error}): expected the keys in docs/robots.md") from None
+    except KeyError as error:
+        said = str(error.args[0])[:80]
+        raise UserError(f"{facts} lacks or misnames {said}: expected the keys in docs/robots.md") from None
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{path.parent} cannot be read as a robot: {' '.join(str(error).split())}") from None
 
 
 def _read(name: str, path: Path) -> Robot:
@@ -129,6 +154,7 @@ def _read(name: str, path: Path) -> Robot:
         default[7 + index[joint]] = angle
     robot = Robot(
         name=name,
+        path=path,
         description=facts.get("description") or f"{len(joint_names)} joints, {model.body_mass.sum():.0f} kg",
         model=model,
         joint_names=joint_names,
@@ -159,8 +185,8 @@ def _read(name: str, path: Path) -> Robot:
         self_collision=bool((model.geom_conaffinity[model.geom_bodyid > 0] != 0).any()),
         landmarks={part: model.body(body).id - 1 for part, body in facts.get("landmarks", {}).items()},
         gait=facts.get("gait", {}),
-        view_distance=facts["camera"]["distance"],
-        view_height=facts["camera"]["height"],
+        view_distance=float(facts["camera"]["distance"]),
+        view_height=float(facts["camera"]["height"]),
     )
     if "default_height" in facts:
         robot.default_qpos[2] = facts["default_height"]

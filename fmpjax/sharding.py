@@ -92,7 +92,8 @@ def on_host(tree: Any) -> Any:
 
 def of(array: jax.Array) -> Mesh | None:
     """The mesh that an array lies on, None where it is on one device."""
-    return array.sharding.mesh if isinstance(array.sharding, NamedSharding) else None
+    # An array that is no tracer has a mesh of devices, not an abstract one.
+    return array.sharding.mesh if isinstance(array.sharding, NamedSharding) else None  # ty: ignore[invalid-explicit-return]
 
 
 def rows(over: Mesh) -> NamedSharding:

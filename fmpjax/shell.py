@@ -5,7 +5,7 @@ import dataclasses
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, Union
 
@@ -30,7 +30,7 @@ def default(text: object) -> Any:
 
 def parse(what: Group | Callable[..., Any], program: str, arguments: Sequence[str] | None = None) -> Any:
     """Parse a command line: an instance of the command's class, or what its function returned."""
-    options = {"prog": program, "args": arguments, "config": (tyro.conf.DisallowNone,)}
+    options: dict[str, Any] = {"prog": program, "args": arguments, "config": (tyro.conf.DisallowNone,)}
     if isinstance(what, Group):
         return tyro.cli(_union(what), description=what.sentence, **options)
     return tyro.cli(what, **options)
@@ -57,7 +57,7 @@ def program() -> str:
 
 
 @contextlib.contextmanager
-def ending() -> Iterator[None]:
+def ending() -> Generator[None]:
     """Around a command: bad input is one sentence and exit code 2; a reader that has gone ends it in silence."""
     # The video encoder is a child process; it is started by exec at once and never touches JAX's threads.
     warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
@@ -79,7 +79,7 @@ def ending() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _refusing() -> Iterator[None]:
+def _refusing() -> Generator[None]:
     try:
         yield
     except UserError as error:

@@ -253,10 +253,10 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.json").write_text(config.to_json(preset("smoke")))
     run = runs.Run.open(tmp_path / "run")
-    monkeypatch.setattr(deploy.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"needs the package onnx, .*: install the extra fmpjax\[deploy\]"):
         runs.export(run, tmp_path / "out", onnx=True)
-    monkeypatch.setattr(deploy.importlib.util, "find_spec", lambda name: True)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: True)
     with pytest.raises(UserError, match="run has no checkpoint: expected one, of which --onnx takes the policy"):
         runs.export(run, tmp_path / "out", onnx=True)
     assert not (tmp_path / "out").exists()

@@ -13,9 +13,10 @@ import pytest
 
 from fmpjax import cli, diagnose
 from fmpjax.config import flatten, preset, to_json
+from fmpjax.diagnose import rules, sentences
 from fmpjax.errors import UserError
 
-ROOT = Path(diagnose.__file__).parents[1]
+ROOT = Path(__file__).parents[1]
 RULES = {rule.name: rule for rule in diagnose.RULES}
 
 TRAINING = {
@@ -171,7 +172,7 @@ def test_settings_of_another_reward_are_not_named():
     ],
 )
 def test_where_most_episodes_fall_the_gait_is_not_judged(figures):
-    found, lacking = diagnose._apply(course(**figures))
+    found, lacking = sentences.apply_rules(course(**figures))
     assert list(found) in (["falls early"], ["falls late"]) and not set(lacking) - {"eval/excursion"}
 
 
@@ -218,7 +219,7 @@ def test_a_missing_figure_silences_its_rules_and_is_named(name):
     made = course(fit_skipped=1)
     evaluation = {k: v for k, v in made.evaluation.items() if f"eval/{k}" != name}
     rows = [{k: v for k, v in row.items() if k != name or k == "transitions"} for row in made.rows]
-    found, lacking = diagnose._apply(diagnose.Course(rows, made.config, evaluation))
+    found, lacking = sentences.apply_rules(diagnose.Course(rows, made.config, evaluation))
     assert set(found) == {"reward updates skipped"} - set(lacking.get("fit/skipped", []))
     of_amp = ("fit/discriminator_loss", "fit/agent_accuracy")
     of_falls = ("env/cap", "train/episode_length", "eval/mean_length")
@@ -286,7 +287,7 @@ def courses():
 def test_the_last_policy_of_a_course(courses, name):
     rows, config, _ = courses[name]
     made = diagnose.Course(rows, config, diagnose.newest(rows))
-    found, lacking = diagnose._apply(made)
+    found, lacking = sentences.apply_rules(made)
     assert list(found) == SYMPTOMS[name]
     # Courses from before turning was measured do not say how the policy turns.
     old = name in ("table1_bank_queries/fmp-dataset-seed0",)
@@ -306,7 +307,7 @@ def test_no_rule_is_for_a_method_or_a_setting_that_does_not_exist():
     for rule in diagnose.RULES:
         assert set(rule.look) <= set(known) and set(rule.methods) <= set(priors.METHODS)
         for method in rule.methods or priors.METHODS:
-            assert any(diagnose._reads(method, key) for key in rule.look), (rule.name, method)
+            assert any(rules.reads(method, key) for key in rule.look), (rule.name, method)
 
 
 def test_the_page_has_the_ranges_of_the_rules():

@@ -87,7 +87,7 @@ def _make(*arguments: str) -> subprocess.CompletedProcess:
         (("evaluate", "RUN=a", "PRESET=smoke"), r"PRESET: make evaluate takes RUN ARGS .*"),
         (("PRESET=smoke",), r"PRESET: make help takes .*"),
         *(((target, "XYZ=1"), rf"XYZ: make {target} takes .*")
-          for target in ("render", "test", "test-fast", "check", "format", "build", "clean", "help")),
+          for target in ("render", "test", "test-fast", "coverage", "check", "format", "build", "clean", "help")),
     ],
 )  # fmt: skip
 def test_make_refuses_an_unknown_variable(arguments, unknown):

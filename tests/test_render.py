@@ -14,7 +14,7 @@ from PIL import Image
 from fmpjax import robots, runs
 from fmpjax.errors import UserError
 from fmpjax.runs import outputs
-from fmpjax.viz import curves, render
+from fmpjax.viz import curves, opengl, render, video
 
 SIZE = {"width": 96, "height": 72}
 
@@ -95,16 +95,16 @@ def test_backend_can_be_switched_off(monkeypatch):
 
 def test_no_driver_means_skeleton(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(render, "_PROBE", "raise SystemExit(1)")
+    monkeypatch.setattr(opengl, "_PROBE", "raise SystemExit(1)")
     assert render.backend.__wrapped__() == "skeleton"
 
 
 @pytest.fixture
 def only_egl(monkeypatch):
     """EGL draws, nothing else does, and nothing has been said yet."""
-    monkeypatch.setattr(render, "_HERE", ("egl", "osmesa"))
-    monkeypatch.setattr(render, "_draws", lambda name: name == "egl")
-    render._say.cache_clear()
+    monkeypatch.setattr(opengl, "_HERE", ("egl", "osmesa"))
+    monkeypatch.setattr(opengl, "_draws", lambda name: name == "egl")
+    opengl.say.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -123,8 +123,8 @@ def test_another_backend_draws_where_the_one_asked_for_does_not(only_egl, monkey
 
 def test_the_backend_asked_for_is_tried_first(monkeypatch):
     tried = []
-    monkeypatch.setattr(render, "_HERE", ("egl", "osmesa"))
-    monkeypatch.setattr(render, "_draws", lambda name: not tried.append(name))
+    monkeypatch.setattr(opengl, "_HERE", ("egl", "osmesa"))
+    monkeypatch.setattr(opengl, "_draws", lambda name: not tried.append(name))
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     assert render.backend.__wrapped__() == "osmesa" and tried == ["osmesa"]
 
@@ -133,8 +133,8 @@ def test_a_driver_that_fails_after_all_leaves_the_skeleton(robot, walk, monkeypa
     def fail(name):
         raise RuntimeError("no driver\nat all")
 
-    render._say.cache_clear()
-    monkeypatch.setattr(render.importlib, "import_module", fail)
+    opengl.say.cache_clear()
+    monkeypatch.setattr(opengl.importlib, "import_module", fail)
     frames = render.render_frames(robot, walk, using="egl", **SIZE)
     np.testing.assert_array_equal(frames, render.render_frames(robot, walk, using="skeleton", **SIZE))
     render.render_frames(robot, walk, using="egl", **SIZE)
@@ -193,7 +193,7 @@ def test_mp4_or_gif_is_what_is_written(tmp_path):
 
 
 def test_without_an_encoder_a_gif_is_written(tmp_path, monkeypatch):
-    monkeypatch.setattr(render, "_encoder", lambda: None)
+    monkeypatch.setattr(video, "_encoder", lambda: None)
     path = render.write_video(tmp_path / "walk.mp4", _noise(2), fps=30)
     assert path == tmp_path / "walk.gif" and path.exists()
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from fmpjax import cli, motion, rotations
 from fmpjax.errors import UserError
 from fmpjax.motion import bvh, check, gait, retarget, soles
+from fmpjax.motion.retarget import feet
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 # Joints and their parents, by LaFAN1's names; what is a landmark of the robot; CMU's names.
@@ -176,10 +177,10 @@ def test_planted_foot_stays_and_rolls_about_its_toe(robot):
     drift = np.linspace(0.0, 0.04, frames)
     free = np.column_stack([1.0 + drift, np.full(frames, 0.1), np.full(frames, 0.3)])
     stands = np.ones(frames, bool)
-    path = retarget._planted(robot, "left", free, foot_wxyz, stands, 30.0)
+    path = feet.planted(robot, "left", free, foot_wxyz, stands, 30.0)
     np.testing.assert_allclose(path[:10, 0], path[0, 0], atol=1e-12)
     np.testing.assert_allclose(path[:, 0].mean(), free[:, 0].mean(), atol=1e-12)
-    points, radius = retarget._sole(robot, "left")
+    points, radius = feet.sole(robot, "left")
     toe = points[np.argmax(points[:, 0])]
     placed = path + rotations.rotate(foot_wxyz, toe)
     np.testing.assert_allclose(placed[:, 0], placed[0, 0], atol=1e-12)
@@ -191,11 +192,11 @@ def test_swinging_foot_clears_the_floor(robot):
     free = np.zeros((frames, 3))
     stands = np.zeros(frames, bool)
     stands[[0, 1, -2, -1]] = True
-    path = retarget._planted(robot, "left", free, np.tile(IDENTITY, (frames, 1)), stands, 30.0)
-    height = path[:, 2] + retarget._lowest(robot, "left", IDENTITY)
+    path = feet.planted(robot, "left", free, np.tile(IDENTITY, (frames, 1)), stands, 30.0)
+    height = path[:, 2] + feet.sole_height(robot, "left", IDENTITY)
     np.testing.assert_allclose(height[stands], 0, atol=1e-12)
-    np.testing.assert_allclose(height[4:-4], retarget.CLEARANCE, atol=1e-12)
-    np.testing.assert_allclose(height[2], retarget.CLEARANCE / 3, atol=1e-12)
+    np.testing.assert_allclose(height[4:-4], feet.CLEARANCE, atol=1e-12)
+    np.testing.assert_allclose(height[2], feet.CLEARANCE / 3, atol=1e-12)
 
 
 def test_any_motion_is_solved_or_refused(robot, source):

@@ -72,7 +72,7 @@ def load(
             f"{file}: {len(qpos)} frames at {source_rate:g} Hz give {count} samples at {rate:g} Hz, "
             f"expected at most {MOST_SAMPLES}"
         )
-    clip = MotionClip.from_qpos(file.stem, robot, rate, resample(qpos, source_rate, rate))
+    clip = MotionClip.from_qpos(file.stem, robots.load(robot).name, rate, resample(qpos, source_rate, rate))
     if recording.loops and frames is None and clip.duration < LOOPED:
         times = math.ceil(LOOPED / clip.duration)
         clip = edit.repeated(clip, times)
@@ -103,7 +103,7 @@ def record(
     file = locate(path, robot)
     recording = readers.read(file, loaded, Options(fps, quaternion, words, degrees))
     rows = cut(file, recording.qpos, frames)
-    if len(rows) == len(recording.qpos):
+    if frames is None or len(rows) == len(recording.qpos):
         return file, recording
     first, last = span(frames, len(recording.qpos))
     fact = Fact("rows", f"{first} to {last} of {len(recording.qpos)}", "--frames")

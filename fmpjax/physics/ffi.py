@@ -129,4 +129,5 @@ def _array(buffers: _Buffers) -> np.ndarray:
     shape = [buffer.dims[i] for i in range(buffer.rank)]
     dtype = np.dtype(_DTYPES[buffer.dtype])
     size = int(np.prod(shape)) * dtype.itemsize
-    return np.frombuffer((ctypes.c_char * size).from_address(buffer.data), dtype).reshape(shape)
+    memory = (ctypes.c_char * size).from_address(buffer.data)
+    return np.frombuffer(memory, dtype).reshape(shape)  # ty: ignore[no-matching-overload] - ctypes' arrays are buffers

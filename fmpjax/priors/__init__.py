@@ -1,11 +1,13 @@
-"""Motion priors by name. Adding a method is one file here and one line in the registry."""
+"""Motion priors by name. Adding a method is one file here and one line in the registry, or a call of `register`."""
+
+from collections.abc import Callable
 
 from fmpjax.config import Config
 from fmpjax.errors import UserError
 from fmpjax.priors import amp, barycentric, empirical, flow, gail, pwil, smp, wail
 from fmpjax.priors.base import Expert, MotionPrior, Reward, Rollout, couple, median_reward
 
-_REGISTRY = {
+_REGISTRY: dict[str, Callable[[Expert, Config], MotionPrior]] = {
     "fmp": flow.make,
     "endpoint": flow.make_endpoint,
     "value": flow.make_value,
@@ -32,6 +34,17 @@ def make(method: str, expert: Expert, config: Config) -> MotionPrior:
     """
     check(method)
     return _REGISTRY[method](expert, config)
+
+
+def register(method: str, make: Callable[[Expert, Config], MotionPrior]) -> None:
+    """Add a method from outside of the package: ``make`` builds it, and ``method`` names it in a configuration.
+
+    Raises:
+      UserError: the name is taken.
+    """
+    if _REGISTRY.get(method, make) is not make:
+        raise UserError(f"method {method!r} is registered already: expected a new name beside {', '.join(_REGISTRY)}")
+    _REGISTRY[method] = make
 
 
 def descriptions() -> dict[str, str]:
@@ -75,5 +88,6 @@ __all__ = [
     "make",
     "median_reward",
     "normalizes",
+    "register",
     "remembers",
 ]

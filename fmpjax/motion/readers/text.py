@@ -146,7 +146,7 @@ def _layout(
     """Columns of the root's place and quaternion, the latter's order, the joints', the times', names of the rest."""
     plain = [plain_name(name) for name in names] if names else []
     known = set(map(plain_name, robot.joint_names))
-    if not known & set(plain):
+    if names is None or not known & set(plain):
         # No header, or one that names no joint: everything is in the usual order, after a column of row numbers.
         time = next((i for i, name in enumerate(plain[:2]) if name in _TIME), None)
         skip = sum(name in (*_TIME, *_COUNTER) for name in plain[:2]) if plain else 0

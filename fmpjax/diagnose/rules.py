@@ -1,99 +1,18 @@
-"""What is wrong with a run, in words: one sentence per symptom, with the figure, its healthy range and where to look.
-
-`RULES` is the one place where the healthy ranges stand; the table in ``docs/metrics.md`` is `page()`. A rule reads a
-`Course`: the rows of ``metrics.csv``, the configuration and one evaluation. The bounds separate the courses that walk
-from those that do not among the 62 below ``experiments/results``, which hold 354 evaluations; `Rule.evidence` names
-them. Where no course shows the fault, the bound lies beyond all that the courses reach, and the evidence says so.
-
-A figure that a course lacks silences the rules that read it, and the report says which.
-"""
+"""The symptoms and their healthy ranges: the one place where these stand."""
 
 import dataclasses
-import json
 import math
-import statistics
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
 
 from fmpjax import config as configuration
-from fmpjax import tables
-from fmpjax.config import Config
-from fmpjax.errors import UserError
-from fmpjax.logs import MetricsLog
-from fmpjax.metrics import TURNS
-
-RECENT = 10  # rows that a training figure is the mean of: a million transitions of `laptop`
-MOVES = 0.1  # m/s, from which a demonstration moves
-TRAVELS = 0.15  # of the demonstration's speed, from which a policy travels
-STEPS = 0.5  # excursion from which the legs step
-STEADIEST = 0.3  # rad/s, the least turning rate that errors in turning are measured against
-DISTINCT = 0.1  # score spread from which the windows differ by more than the noise of one source bank
-GOOD = 0.3  # quality from which there is something to lose
-# Share of the budget by which the good runs of `laptop` stay up, per reset.
-SETTLED = {"dataset": 0.5, "fixed": 0.7}
+from fmpjax.diagnose import measures
+from fmpjax.diagnose.course import Course
+from fmpjax.diagnose.measures import DISTINCT, STEADIEST, STEPS, TRAVELS
 
 _POTENTIALS = ("fmp", "endpoint", "value")
 _CENTERED = (*_POTENTIALS, "bank16")  # the reward is divided by the score's spread
 _TRANSPORTS = (*_CENTERED, "barycentric")
 _SECTIONS = ("prior", "amp", "gail", "wail", "pwil", "smp")  # settings of a reward; transports share "prior"
-
-
-class Missing(KeyError):
-    """A figure that a course lacks, or that is not defined in it."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Course:
-    """What a diagnosis reads. ``course["eval/NAME"]`` is of the evaluation, any other a mean over the recent rows."""
-
-    rows: Sequence[Mapping[str, Any]]  # of metrics.csv, oldest first; values are numbers, texts of numbers or empty
-    config: Config
-    evaluation: Mapping[str, Any]  # as in evaluation.json; empty where there is none yet
-    source: str = "the newest evaluation"  # where the evaluation is from
-
-    def __getitem__(self, name: str) -> float:
-        """The figure called ``name`` in the units of its column.
-
-        Raises:
-          Missing: the course has no such figure.
-        """
-        if name.startswith("eval/"):
-            value = _number(name, self.evaluation.get(name.removeprefix("eval/")))
-            return _defined(name, value)
-        return self.mean(name, self.recent)
-
-    @property
-    def recent(self) -> Sequence[Mapping[str, Any]]:
-        """The last rows. The first one of a run is left out where there are others: it is of an untrained policy."""
-        return self.rows[1:][-RECENT:] or self.rows
-
-    def mean(self, name: str, rows: Sequence[Mapping[str, Any]]) -> float:
-        """Mean of a column over those of ``rows`` that have it."""
-        values = [_number(name, row.get(name)) for row in rows]
-        values = [value for value in values if not math.isnan(value)]
-        return _defined(name, statistics.fmean(values) if values else math.nan)
-
-    @property
-    def progress(self) -> float:
-        """Share of the budget behind the last row."""
-        return _number("transitions", self.rows[-1].get("transitions")) / self.config.transitions
-
-
-def _number(name: str, value: Any) -> float:
-    """A cell as a number; NaN where it is empty."""
-    if value is None or value == "":
-        return math.nan
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise UserError(f"{name} of the run's figures is {value!r}: expected a number") from None
-
-
-def _defined(name: str, value: float) -> float:
-    if math.isnan(value):
-        raise Missing(name)
-    return value
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,7 +60,7 @@ class Rule:
             return None
         settings = configuration.flatten(course.config)
         # A switch that is off already is no advice.
-        mine = [key for key in self.look if _reads(course.config.method, key) and settings[key] is not False]
+        mine = [key for key in self.look if reads(course.config.method, key) and settings[key] is not False]
         look = [f"{key} (now {settings[key]})" for key in mine]
         where = " and ".join([", ".join(look[:-1]), look[-1]] if look[1:] else look)
         says = self.says.format_map(course)
@@ -156,7 +75,7 @@ _READ_BY = {
 }
 
 
-def _reads(method: str, setting: str) -> bool:
+def reads(method: str, setting: str) -> bool:
     """Whether the reward reads the setting, or it is not one of a reward."""
     if setting in _READ_BY:
         return method in _READ_BY[setting]
@@ -164,116 +83,12 @@ def _reads(method: str, setting: str) -> bool:
     return section not in _SECTIONS or section == (method if method in _SECTIONS else "prior")
 
 
-def _fallen(course: Course) -> float:
-    """Share of the evaluation's episodes that end in a fall."""
-    return course["eval/falls"] / max(course["eval/episodes"], 1.0)
-
-
-def _fall_step(course: Course) -> float:
-    """Mean step at which those that fall do; the others last to the end."""
-    falls, episodes = course["eval/falls"], course["eval/episodes"]
-    lasted = (episodes - falls) * course.config.env.episode_steps
-    return (course["eval/mean_length"] * episodes - lasted) / max(falls, 1.0)
-
-
-def _falls(course: Course, *, late: bool) -> float | None:
-    share = _fallen(course)
-    return share if share and (_fall_step(course) > course.config.env.last_cap) == late else None
-
-
-def _turning(course: Course) -> float:
-    """Turning rate of the demonstration either way, rad/s; old courses have one demonstration and no such column."""
-    try:
-        return course["eval/demonstration_turning"]
-    except Missing:
-        return abs(course["eval/demonstration_turn"])
-
-
-def _travel(course: Course) -> float | None:
-    """Late speed over the demonstration's; None where most episodes fall, or the demonstration stands."""
-    if _fallen(course) > 0.5 or course["eval/demonstration_speed"] < MOVES:
-        return None
-    try:
-        turns = _turning(course) > TURNS
-    except Missing:  # courses from before turning was measured are of straight walks
-        turns = False
-    return course["eval/path_speed" if turns else "eval/late_speed"] / course["eval/demonstration_speed"]
-
-
-def _excursion(course: Course, *, travels: bool) -> float | None:
-    travel = _travel(course)
-    return course["eval/excursion"] if travel is not None and (abs(travel) >= TRAVELS) == travels else None
-
-
-def _marching(course: Course) -> float | None:
-    travel = _travel(course)
-    return None if travel is None or course["eval/excursion"] < STEPS else abs(travel)
-
-
-def _pace(course: Course) -> float | None:
-    travel = _travel(course)
-    return None if travel is None or abs(travel) < TRAVELS else travel
-
-
-def _turn_error(course: Course) -> float | None:
-    if _pace(course) is None:
-        return None
-    own = course["eval/demonstration_turn"]
-    # Left and right turns of several motions cancel in the means.
-    if _turning(course) > abs(own) + TURNS:
-        return None
-    return abs(course["eval/turn"] - own) / max(abs(own), STEADIEST)
-
-
-def _limp(course: Course) -> float | None:
-    """Imbalance less the demonstration's own, which only evaluation.json tells."""
-    if _fallen(course) > 0.5 or course["eval/excursion"] < STEPS:
-        return None
-    ranges = course.evaluation.get("expert_ranges")
-    if not isinstance(ranges, list) or not all(isinstance(value, int | float) for value in ranges):
-        ranges = []
-    pairs = list(zip(ranges[: len(ranges) // 2], ranges[len(ranges) // 2 :], strict=False))
-    own = sum(2.0 * abs(a - b) / max(a + b, 1e-9) for a, b in pairs) / max(len(pairs), 1)
-    return course["eval/imbalance"] - own
-
-
-def _stamping(course: Course) -> float | None:
-    return None if _fallen(course) > 0.5 else course["eval/excursion"]
-
-
-def _kept(course: Course) -> float | None:
-    """Quality of the course's newest evaluation over its best."""
-    found = [_number("eval/quality", row.get("eval/quality")) for row in course.rows]
-    found = [value for value in found if not math.isnan(value)]
-    if not found:
-        raise Missing("eval/quality")
-    return found[-1] / max(found) if max(found) >= GOOD else None
-
-
-def _correlation(course: Course) -> float | None:
-    """Correlation over the newest rows in which windows differ; None where none does."""
-    course["fit/score_spread"], course["fit/value_correlation"]
-    spread = [_number("fit/score_spread", row.get("fit/score_spread")) for row in course.rows]
-    rows = [row for row, value in zip(course.rows, spread, strict=True) if value >= DISTINCT]
-    return course.mean("fit/value_correlation", rows[-RECENT:]) if rows else None
-
-
-def _nonfinite(course: Course) -> float:
-    """The count since the start, so of the last row."""
-    return course.mean("train/nonfinite", course.rows[-1:])
-
-
-def _kl(course: Course) -> float | None:
-    target = course.config.ppo.target_kl
-    return course["ppo/kl"] / target if target else None
-
-
 RULES = (
     Rule(
         "falls early",
         "It falls within the steps that training episodes have, in {eval/falls:.0f} of {eval/episodes:.0f} episodes",
         "share of evaluation episodes that fall",
-        lambda course: _falls(course, late=False),
+        lambda course: measures.falls(course, late=False),
         Range(high=0.1),
         ("env.reset_noise", "ppo.gae_lambda", "transitions"),
         "walks end at 0.06 or less; `lafan1_standing` 0.29, `table1/value-fixed-seed0` 1",
@@ -283,7 +98,7 @@ RULES = (
         "falls late",
         "It falls later than training episodes last, in {eval/falls:.0f} of {eval/episodes:.0f} episodes",
         "share of evaluation episodes that fall",
-        lambda course: _falls(course, late=True),
+        lambda course: measures.falls(course, late=True),
         Range(high=0.1),
         ("env.last_cap", "evaluations"),
         "walks end at 0.06 or less; `learning_apart/late-128-seed0` 0.37, `mirrored-seed0` 0.48",
@@ -303,7 +118,7 @@ RULES = (
         "stands",
         "It stands, at {eval/late_speed:.2f} m/s where the demonstration goes at {eval/demonstration_speed:.2f}",
         "excursion",
-        lambda course: _excursion(course, travels=False),
+        lambda course: measures.excursion(course, travels=False),
         Range(low=STEPS),
         ("prior.query_is_bank", "ppo.discount", "method"),
         "`lafan1_standing` 0.18, `table1/barycentric-*` 0.01, `table1_bank_queries/fmp-fixed-seed0` 0.36; none that "
@@ -315,7 +130,7 @@ RULES = (
         "Its legs step at an excursion of {eval/excursion:.2f} and it does not travel: it marches on the spot, or "
         "stops on the way",
         "late speed, either way, over the demonstration's",
-        _marching,
+        measures.marching,
         Range(low=TRAVELS),
         ("env.last_cap", "ppo.discount", "evaluations"),
         "`learning_apart/late-128-seed0` 0.08, `mirrored-seed0` 0.05; the slowest that walks is at 0.26",
@@ -325,7 +140,7 @@ RULES = (
         "shuffles",
         "It travels on steps that are too small",
         "excursion",
-        lambda course: _excursion(course, travels=True),
+        lambda course: measures.excursion(course, travels=True),
         Range(low=STEPS),
         ("features.deviation_floor", "features.angular_velocity_floor"),
         "all that walk are at 0.69 or more; no course shuffles",
@@ -335,7 +150,7 @@ RULES = (
         "stamps",
         "Its legs move much further than the demonstration's",
         "excursion",
-        _stamping,
+        measures.stamping,
         Range(high=1.5),
         ("env.action", "ppo.bound_penalty"),
         "the highest is 1.40, `lafan1_walk_seed1` on the way; no course stamps",
@@ -344,7 +159,7 @@ RULES = (
         "too slow",
         "It is slower than the demonstration",
         "late speed over the demonstration's",
-        _pace,
+        measures.pace,
         Range(low=0.6),
         ("features.angular_velocity_floor", "frames", "evaluations"),
         "walks end between 0.64 and 1.33; `learning_apart/lambda-090-seed2` ends at 0.50, `lafan1_walk_seed1` at "
@@ -355,7 +170,7 @@ RULES = (
         "too fast",
         "It is faster than the demonstration",
         "late speed over the demonstration's",
-        _pace,
+        measures.pace,
         Range(high=1.4),
         ("frames", "evaluations"),
         "walks end between 0.64 and 1.33; `table1_bank_queries/bank16-fixed-seed0` ends at 1.53, `lafan1_fixed_seed1` "
@@ -366,7 +181,7 @@ RULES = (
         "turns wrong",
         "It turns at {eval/turn:+.2f} rad/s where the demonstration turns at {eval/demonstration_turn:+.2f}",
         f"error of the turning rate over the demonstration's, or over {STEADIEST:g} rad/s if that turns less",
-        _turn_error,
+        measures.turn_error,
         Range(high=0.5),
         ("features.axes", "motion"),
         "`turn_left` ends at 0.08, straight walks at 0.29 or less; `turn_left` at 4.3 M, where it falls, is at 0.97",
@@ -376,7 +191,7 @@ RULES = (
         "limps",
         "It limps",
         "left-right imbalance beyond the demonstration's own",
-        _limp,
+        measures.limp,
         Range(high=0.4),
         ("motion", "transitions"),
         "the highest is 0.33, `table1/value-dataset-seed0` on the way; no course that stays up limps",
@@ -386,7 +201,7 @@ RULES = (
         "got worse",
         "The newest policy is much worse than the best one, which `best/` keeps",
         "`eval/quality` of the newest evaluation over the best",
-        _kept,
+        measures.kept,
         Range(low=0.25),
         ("ppo.target_kl", "evaluations"),
         "`learning_apart/late-128-seed0` 0.06, `mirrored-seed0` 0.03; `lafan1_walk_seed1`, which only slows down, 0.33",
@@ -484,7 +299,7 @@ RULES = (
         "fit does not follow",
         "The learned score does not follow the transport's",
         "`fit/value_correlation`",
-        _correlation,
+        measures.correlation,
         Range(low=0.5),
         ("prior.learning_rate", "prior.updates", "prior.clip_norm"),
         "no such row under 0.57; with smaller spreads good walks go down to −0.08, which is no fault",
@@ -495,7 +310,7 @@ RULES = (
         "states not finite",
         "There were numbers that are not finite",
         "`train/nonfinite`, since the start",
-        _nonfinite,
+        measures.nonfinite,
         Range(high=0.0),
         ("physics.timestep", "nonfinite_limit"),
         "0 in every row of every course",
@@ -523,7 +338,7 @@ RULES = (
         "KL off its target",
         "The policy's updates are not of the size that is asked for",
         "`ppo/kl` over `ppo.target_kl`",
-        _kl,
+        measures.kl,
         Range(0.5, 2.0),
         ("ppo.target_kl", "ppo.learning_rate"),
         "0.73 to 1.40 at the ends, no row above 1.9 after 0.15 M transitions; no course without a target",
@@ -547,93 +362,3 @@ RULES = (
         "0.71 or more at the ends; under 0 in the first row of the fixed pose alone",
     ),
 )
-
-
-def symptoms(course: Course) -> dict[str, str]:
-    """The sentence of each rule whose figure is out of its range, by the rule's name."""
-    return _apply(course)[0]
-
-
-def _apply(course: Course) -> tuple[dict[str, str], dict[str, list[str]]]:
-    """Sentences by rule, and the rules that could not be checked by the figure that they lack."""
-    found, lacking = {}, {}
-    for rule in RULES:
-        try:
-            sentence = rule.sentence(course)
-        except Missing as missing:
-            lacking.setdefault(missing.args[0], []).append(rule.name)
-            continue
-        if sentence is not None:
-            found[rule.name] = sentence
-    return found, lacking
-
-
-def report(course: Course) -> list[str]:
-    """The diagnosis: a sentence per symptom, or one that there is none; then what could not be checked."""
-    found, lacking = _apply(course)
-    lines = list(found.values()) or ["No symptom: every figure that was checked is in its healthy range."]
-    settled = SETTLED[course.config.env.reset]
-    if found and course.progress < settled:
-        lines.append(
-            f"This is at {100 * course.progress:.0f} % of the budget: good runs of `laptop` from this reset fall and "
-            f"stand, too, up to {100 * settled:.0f} %."
-        )
-    if lacking:
-        which = "; ".join(f"{', '.join(names)} (no {figure})" for figure, names in lacking.items())
-        lines.append(f"Not checked: {which}.")
-    return lines
-
-
-def text(course: Course) -> str:
-    """The diagnosis as lines for people."""
-    transitions = _number("transitions", course.rows[-1].get("transitions"))
-    rows = f"{len(course.recent)} rows" if course.recent[1:] else "row"
-    head = f"diagnosis at {transitions:,.0f} transitions, by {course.source} and the last {rows} of metrics.csv:"
-    return "\n".join([head, *(f"  - {line}" for line in report(course))])
-
-
-def read(folder: Path, *, last: bool = False) -> Course:
-    """The course in a run folder or in a folder of exported results.
-
-    Args:
-      folder: holds ``config.json`` and ``metrics.csv``; ``evaluation.json``, the best policy's, where there is one.
-      last: take the newest evaluation of ``metrics.csv`` in place of ``evaluation.json``.
-
-    Raises:
-      UserError: a file is missing or broken.
-    """
-    if not (folder / "config.json").is_file():
-        raise UserError(f"{folder} is not a run folder: expected config.json in it")
-    config = configuration.read(folder / "config.json")
-    rows = MetricsLog.read(folder / "metrics.csv")
-    if not rows:
-        raise UserError(f"{folder / 'metrics.csv'} has no rows: expected the metrics of a run that has begun to train")
-    path = folder / "evaluation.json"
-    if last or not path.exists():
-        return Course(rows, config, newest(rows))
-    try:
-        evaluation = json.loads(path.read_text())
-    except ValueError:
-        evaluation = None
-    if not isinstance(evaluation, dict):
-        raise UserError(f"{path} is not valid JSON: expected the figures of an evaluation")
-    return Course(rows, config, evaluation, f"{path.name} (the best policy)")
-
-
-def newest(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Figures of the newest evaluation in the rows, by name; none where there is none."""
-    for row in reversed(rows):
-        if row.get("eval/quality") not in (None, ""):
-            return {name.removeprefix("eval/"): value for name, value in row.items() if name.startswith("eval/")}
-    return {}
-
-
-def page() -> str:
-    """The rules as the table in ``docs/metrics.md``."""
-    lines = ["| symptom | figure | healthy | look at | what the courses show |", "|---|---|---|---|---|"]
-    for rule in RULES:
-        figure = rule.figure + (f", where {rule.when}" if rule.when else "")
-        figure += f" (`{'`, `'.join(rule.methods)}`)" if rule.methods else ""
-        look = ", ".join(f"`{key}`" for key in rule.look)
-        lines.append(tables.row((rule.name, figure, rule.healthy, look, rule.evidence)))
-    return "\n".join(lines)

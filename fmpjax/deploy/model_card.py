@@ -1,0 +1,159 @@
+"""The card for the people who run a policy."""
+
+from pathlib import Path
+from typing import Any
+
+import fmpjax
+from fmpjax import features, tables
+from fmpjax.deploy.origin import Origin
+from fmpjax.motion import bundled
+from fmpjax.policy import Policy
+from fmpjax.robots import Robot
+
+_UNMEASURED = {
+    "root_height": "the root's height",
+    "root_linear_velocity": "the root's linear velocity",
+    "key_points": "the places of key points",
+}
+_CARD = """# {run}
+
+A policy for the robot `{robot}` ({description}). It was trained by {method} with fmpjax {version}, commit {commit},
+preset `{preset}`. It acts at {rate:g} Hz. {unmeasured}
+
+## Training
+
+At most {transitions:,} transitions, reset `{reset}`, physics at {physics_rate:g} Hz. The demonstrations:
+
+| motion | weight | license |
+|---|---|---|
+{motions}
+
+## Evaluation
+
+{evaluation}
+
+## Robustness
+
+{robustness}
+
+## Observation
+
+`obs` has {size} numbers, not normalized:
+
+| from | to | name | what it is |
+|---|---|---|---|
+{observation}
+
+## Action
+
+`actions` has {joints} numbers, one per joint in the order below. The target of a joint (rad) is
+offset + scale × action. The graph keeps it within low and high. A servo holds it with
+torque = stiffness × (target − angle) − damping × velocity, within ± effort.
+
+| joint | offset, rad | scale, rad | low, rad | high, rad | stiffness, N m/rad | damping, N m s/rad | effort, N m |
+|---|---|---|---|---|---|---|---|
+{actions}
+"""
+_MEANING = {
+    "root_height": "height of the root above the floor, m",
+    "root_rotation_6d": "x axis and z axis of the root, in the world",
+    "root_linear_velocity": "of the root, in the world, m/s",
+    "root_angular_velocity": "of the root, in the world, rad/s",
+    "joint_position": "angles, rad, in the order of the joints",
+    "joint_rotation_6d": "x axis and z axis of each joint's rotation, in the order of the joints",
+    "joint_velocity": "rad/s, in the order of the joints",
+    "key_points": "of {points}: place less the root's, in the world's axes, m",
+    "base_ang_vel": "of the root, in its own axes, rad/s",
+    "projected_gravity": "where gravity points, a unit vector in the root's axes",
+    "velocity_commands": "wanted velocity forward and to the left, m/s, and turn, rad/s",
+    "joint_pos": "angles, rad, in the order of the joints",
+    "joint_pos_rel": "angles less the offset of the action, rad, in the order of the joints",
+    "joint_vel_rel": "rad/s, in the order of the joints",
+    "last_action": "`actions` of the step before, zero at the start",
+}
+
+
+def unmeasured(robot: Robot, observation: str) -> str | None:
+    """A sentence that names what the policy observes and no robot measures; None where there is no such thing."""
+    found = [_UNMEASURED[name] for name in features.observation_terms(robot, observation) if name in _UNMEASURED]
+    if not found:
+        return None
+    listed = ", ".join(found[:-1]) + " and " + found[-1] if len(found) > 1 else found[0]
+    return (
+        f"the policy observes {listed}, which no sensor of the robot measures: "
+        "it runs in simulation, and on hardware only with a state estimator"
+    )
+
+
+def card(policy: Policy, robot: Robot, origin: Origin) -> str:
+    """The model card, Markdown."""
+    config = origin.config
+    sentence = unmeasured(robot, policy.observation)
+    rows, start = [], 0
+    for name, width in features.observation_terms(robot, policy.observation).items():
+        meaning = _MEANING[name].format(points=", ".join(robot.key_point_names))
+        if name == "joint_rotation_6d" and robot.jointless_row is not None:
+            meaning += f", with a row that is always 1, 0, 0, 0, 0, 1 before joint {robot.jointless_row}"
+        rows.append(tables.row((str(start), str(start + width - 1), f"`{name}`", meaning)))
+        start += width
+    numbers = zip(
+        policy.center, policy.scale, policy.low, policy.high, robot.stiffness, robot.damping, robot.effort, strict=True
+    )
+    return _CARD.format(
+        run=origin.run,
+        robot=robot.name,
+        description=robot.description,
+        method=config.method,
+        version=fmpjax.__version__,
+        commit=origin.version,
+        preset=config.preset,
+        rate=policy.rate,
+        unmeasured="" if sentence is None else sentence[0].upper() + sentence[1:] + ".",
+        transitions=config.transitions,
+        reset=config.env.reset,
+        physics_rate=1.0 / config.physics.timestep,
+        motions="\n".join(tables.row((Path(name).name, f"{w:g}", _license(name))) for name, w in origin.motions),
+        evaluation=_evaluated(origin.evaluation),
+        robustness=_robustness(origin.evaluation),
+        size=start,
+        observation="\n".join(rows),
+        joints=len(policy.joint_names),
+        actions="\n".join(
+            tables.row((f"`{joint}`", *(f"{number:.6g}" for number in row)))
+            for joint, row in zip(policy.joint_names, numbers, strict=True)
+        ),
+    )
+
+
+def _license(motion: str) -> str:
+    return "MIT, bundled with fmpjax" if motion in bundled() else "unknown: ask the motion's source"
+
+
+def _evaluated(figures: dict[str, Any] | None) -> str:
+    if figures is None:
+        return "The run has no evaluation of this policy; `fmpjax evaluate` makes one."
+
+    def speed(name: str) -> str:
+        return "undefined" if figures.get(name) is None else f"{figures[name]:.3f} m/s"
+
+    return (
+        f"In simulation, on the model it was trained on: {figures['falls']} falls in {figures['episodes']} first "
+        f"episodes, late speed {speed('late_speed')}, of the demonstration {speed('demonstration_speed')}."
+    )
+
+
+def _robustness(figures: dict[str, Any] | None) -> str:
+    starts = (figures or {}).get("starts") or []
+    rows = [tables.row((f"{start['noise']:g}", str(start["falls"]), str(start["episodes"]))) for start in starts]
+    if not rows:
+        return "No disturbance was tried on this policy."
+    return "\n".join(
+        [
+            "Falls by the noise of the joint angles at the start, rad; ten times that, rad/s, of their velocities. "
+            "Pushes, delays and other floors were not tried.",
+            "",
+            "| noise | falls | first episodes |",
+            "|---|---|---|",
+            *rows,
+        ]
+    )

@@ -1,0 +1,28 @@
+"""What is wrong with a run, in words: one sentence per symptom, with the figure, its healthy range and where to look.
+
+`RULES` is the one place where the healthy ranges stand; the table in ``docs/metrics.md`` is `page()`. A rule reads a
+`Course`: the rows of ``metrics.csv``, the configuration and one evaluation. The bounds separate the courses that walk
+from those that do not among the 62 below ``experiments/results``, which hold 354 evaluations; `Rule.evidence` names
+them. Where no course shows the fault, the bound lies beyond all that the courses reach, and the evidence says so.
+
+A figure that a course lacks silences the rules that read it, and the report says which.
+"""
+
+from fmpjax.diagnose.course import Course, Missing, newest, read
+from fmpjax.diagnose.rules import RULES, Range, Rule
+from fmpjax.diagnose.sentences import SETTLED, page, report, symptoms, text
+
+__all__ = [
+    "RULES",
+    "SETTLED",
+    "Course",
+    "Missing",
+    "Range",
+    "Rule",
+    "newest",
+    "page",
+    "read",
+    "report",
+    "symptoms",
+    "text",
+]

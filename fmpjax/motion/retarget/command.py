@@ -1,0 +1,80 @@
+"""What `fmpjax motion retarget` does: a file in, a clip and a report out."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from fmpjax import rotations
+from fmpjax.errors import UserError
+from fmpjax.motion import bvh
+from fmpjax.motion.bvh import Bvh
+from fmpjax.motion.clip import Fact, Reading
+from fmpjax.motion.formats import cut, save, span
+from fmpjax.motion.retarget.fit import retarget
+from fmpjax.motion.retarget.landmarks import AXES, read_skeleton
+from fmpjax.robots import Robot
+
+ODD_FIRST, ODD_SPEED = (
+    5.0,
+    15.0,
+)  # times the frames after it, and rad/s: a first frame that turns so much is another pose
+NEXT = 20  # frames after the first that it is compared with
+
+
+def odd_start(source: Bvh) -> bool:
+    """Whether the first frame is another pose, such as a T-pose, and the motion begins at the second."""
+    if len(source.values) < 4:
+        return False
+    turned = bvh.joint_poses(source._replace(values=source.values[: NEXT + 2])).rotation_wxyz
+    between = rotations.multiply(rotations.conjugate(turned[:-1]), turned[1:])
+    angle = np.linalg.norm(rotations.log_map(between), axis=-1).max(axis=1)
+    return bool(angle[0] * source.rate > ODD_SPEED and angle[0] > ODD_FIRST * angle[1:].max())
+
+
+def convert(
+    file: str | os.PathLike,
+    robot: Robot,
+    out: str | os.PathLike,
+    frames: str | None = None,
+    *,
+    skeleton: str | os.PathLike | None = None,
+    up: str | None = None,
+) -> tuple[str, bool]:
+    """Retarget the BVH ``file``, or its ``frames`` FIRST:LAST, and write the clip as ``out``.
+
+    Args:
+      skeleton: a TOML file that names the skeleton's joint of each part, such as ``left_hip = "LThigh"``.
+      up: the file's axis that is up, "y" or "z".
+
+    Returns:
+      What was read and how it fits, and whether the result is broken. A broken one is written as well.
+
+    Raises:
+      UserError: see `bvh.read`, `formats.cut`, `retarget` and `fmpjax.motion.save`.
+    """
+    file = Path(file)
+    if up not in (None, *AXES):
+        raise UserError(f"--up is {up!r}, expected one of {', '.join(AXES)}")
+    source = bvh.read(file)
+    names = None if skeleton is None else read_skeleton(skeleton)
+    count, said = len(source.values), []
+    cut(file, source.values, frames)  # refuses rows that are not there
+    first, last = (0, count - 1) if frames is None else span(frames, count)
+    if first == 0 and last > 1 and odd_start(source):
+        first = 1
+        said.append("frame 0 is another pose, and is left out")
+    done = retarget(source, robot, file.stem, span=(first, last), skeleton=names, up=up)
+    save(done.clip, out)
+    facts = [*done.clip.reading.facts, Fact("frames", f"{first} to {last}", "--frames" if frames else "all")]
+    verdict, faults = done.verdict(robot)
+    lines = [
+        f"{file} was read as",
+        str(Reading(tuple(facts), tuple(said))),
+        f"wrote {out}: {len(done.clip)} frames at {done.clip.rate:g} Hz, {done.scale:.4g} m per unit of the file, "
+        f"{1000 * done.residual.mean():.1f} mm off the scaled skeleton on average and "
+        f"{1000 * done.residual.max():.1f} mm at worst",
+        f"verdict: {verdict}",
+        *(f"  {fault}" for fault in faults),
+    ]
+    return "\n".join(lines), verdict == "broken"

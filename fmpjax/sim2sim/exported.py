@@ -1,0 +1,142 @@
+"""The policy in an ONNX file from `fmpjax export --onnx`."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fmpjax.errors import UserError
+from fmpjax.sim2sim.observation import TERMS
+from fmpjax.sim2sim.traits import FACTS
+
+
+class Policy(NamedTuple):
+    """What an ONNX file from `fmpjax export --onnx` holds; ``J`` joints."""
+
+    act: Callable[[np.ndarray], np.ndarray]  # observation [O] -> actions [J]
+    terms: dict[str, int]  # names and widths of the observation's parts
+    joint_names: tuple[str, ...]
+    center: np.ndarray  # [J] rad, the targets of action zero
+    scale: np.ndarray  # [J] rad, a unit of action
+    stiffness: np.ndarray  # [J] N m/rad
+    damping: np.ndarray  # [J] N m s/rad
+    effort: np.ndarray  # [J] N m
+    joint_limits: np.ndarray  # [J, 2] rad
+    joint_axes: np.ndarray  # [J, 3]
+    jointless_row: int | None
+    default_qpos: np.ndarray  # [7 + J] where the robot starts
+    key_points: list[dict[str, Any]]
+    fall_shapes: list[dict[str, Any]]
+    step_dt: float  # s, of control
+    physics_dt: float  # s, in training
+    total_mass: float  # kg
+    integrator: str  # MuJoCo's name of it, in training
+    facts: dict[str, np.ndarray]  # what `facts` says of the model of the training
+    robot: str
+
+
+def load(path: str | Path) -> Policy:
+    """Read an exported policy.
+
+    Raises:
+      UserError: onnxruntime is missing, or the file is, or it is no such policy.
+    """
+    try:
+        import onnxruntime
+    except ImportError:
+        raise UserError("sim2sim needs the package onnxruntime: install the extra fmpjax[deploy]") from None
+    if not Path(path).is_file():
+        raise UserError(f"{path} is not a file: expected policy.onnx as `fmpjax export --onnx` writes it")
+    expected = "expected a file as `fmpjax export --onnx` writes it"
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1  # more only wait for each other in so small a network
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime has a class for each kind
+        raise UserError(f"{path} is not an ONNX file ({str(error).splitlines()[0]}): {expected}") from None
+    said = session.get_modelmeta().custom_metadata_map
+    try:
+        _check_plain(said)
+        widths = map(int, said["observation_widths"].split(","))
+        policy = Policy(
+            act=lambda x: session.run(["actions"], {"obs": x[None].astype(np.float32)})[0][0],
+            terms=dict(zip(said["observation_names"].split(","), widths, strict=True)),
+            joint_names=tuple(said["joint_names"].split(",")),
+            center=_numbers(said["action_offset"]),
+            scale=_numbers(said["action_scale"]),
+            stiffness=_numbers(said["joint_stiffness"]),
+            damping=_numbers(said["joint_damping"]),
+            effort=_numbers(said["joint_effort"]),
+            joint_limits=_rows(said["joint_limits"]),
+            joint_axes=_rows(said["joint_axes"]),
+            jointless_row=int(said["jointless_row"]) if said["jointless_row"] else None,
+            default_qpos=_numbers(said["default_qpos"]),
+            key_points=_places(said["key_points"], "offset"),
+            fall_shapes=_places(said["fall_shapes"], "ends", "radius"),
+            step_dt=float(said["step_dt"]),
+            physics_dt=float(said["physics_dt"]),
+            total_mass=float(said["total_mass"]),
+            integrator=said["integrator"],
+            facts={name: _rows(said[name]) for name in FACTS},
+            robot=said["robot"],
+        )
+    except KeyError as error:
+        raise UserError(f"{path} has no metadata {error}: {expected}") from None
+    except (ValueError, TypeError) as error:
+        raise UserError(f"{path} has metadata that cannot be read ({error}): {expected}") from None
+    _check(path, policy, session)
+    return policy
+
+
+def _numbers(text: str, separator: str = ",") -> np.ndarray:
+    numbers = np.array(text.split(separator), np.float64)
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{text[:40]!r} is not finite")
+    return numbers
+
+
+def _rows(text: str) -> np.ndarray:
+    """A matrix; of columns of one number a vector."""
+    rows = np.array([_numbers(row, ";") for row in text.split(",")])
+    return rows[:, 0] if rows.shape[1] == 1 else rows
+
+
+def _places(text: str, *wanted: str) -> list[dict[str, Any]]:
+    """Points or shapes in bodies, as JSON has them."""
+    return [
+        {"body": place["body"], "joint": place["joint"]} | {name: np.array(place[name], np.float64) for name in wanted}
+        for place in json.loads(text)
+    ]
+
+
+def _check_plain(said: dict[str, str]) -> None:
+    """Refuse what mjlab's keys may ask for and a policy of fmpjax never does: scales, clips and histories.
+
+    Raises:
+      ValueError: one of them is asked for.
+    """
+    for key, plain in (("scale", "1.0"), ("clip", "-inf;inf"), ("history_length", "0")):
+        values = set(said[f"observation_terms_{key}"].split(","))
+        if values != {plain}:
+            raise ValueError(f"observation_terms_{key} is {min(values - {plain})}, and sim2sim knows {plain} alone")
+
+
+def _check(path: str | Path, policy: Policy, session) -> None:
+    joints, size = len(policy.joint_names), sum(policy.terms.values())
+    names = [node.name for node in (*session.get_inputs(), session.get_outputs()[0])]
+    if names != ["obs", "actions"]:
+        raise UserError(f"{path} maps {', '.join(names[:-1])} to {names[-1]}: expected obs to actions")
+    taken, given = session.get_inputs()[0].shape, session.get_outputs()[0].shape
+    for name in policy.terms:
+        if name not in TERMS:
+            raise UserError(f"{path} observes {name!r}, which sim2sim does not know: expected {', '.join(TERMS)}")
+    if (taken, given) != ([1, size], [1, joints]):
+        raise UserError(f"{path} maps {taken} to {given}: its metadata tells of [1, {size}] to [1, {joints}]")
+    per_joint = ("center", "scale", "stiffness", "damping", "effort", "joint_limits", "joint_axes")
+    for name, rows in ({name: getattr(policy, name) for name in per_joint} | policy.facts).items():
+        if len(rows) != joints:
+            raise UserError(f"{path} has {len(rows)} of {name}: expected one per joint, {joints}")
+    if len(policy.default_qpos) != 7 + joints:
+        raise UserError(f"{path} has {len(policy.default_qpos)} numbers in default_qpos: expected {7 + joints}")

@@ -1,0 +1,143 @@
+"""A policy's robot in another model, one step of control at a time."""
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from fmpjax.errors import UserError
+from fmpjax.sim2sim.differences import differences
+from fmpjax.sim2sim.exported import Policy
+from fmpjax.sim2sim.model import check_servos, drives_joint, prepare
+from fmpjax.sim2sim.observation import TERMS
+
+_DEEPEST = 1.5e-3  # m, penetration of the floor at the start; the policy's own robot stands 1 mm in it
+
+
+class Simulation:
+    """A policy's robot in another model.
+
+    ``differences`` is a list of sentences: what is not as it was in training. ``time`` is s since the last reset.
+    """
+
+    def __init__(self, policy: Policy, path: str | Path, *, own_gains: bool = False):
+        """Read an MJCF file.
+
+        Args:
+          policy: what is to run on it.
+          path: the file.
+          own_gains: keep the file's position servos; otherwise they get the policy's gains and torque limits.
+
+        Raises:
+          UserError: it cannot be read, or is no model of the policy's robot, or has no servos to keep.
+        """
+        self.policy = policy
+        try:
+            spec = mujoco.MjSpec.from_file(str(path))
+            said = prepare(spec, policy, path, own_gains)
+            self.model = model = spec.compile()
+        except UserError:
+            raise
+        except (ValueError, FileNotFoundError) as error:
+            raise UserError(f"{path} cannot be read as MJCF: {' '.join(str(error).split())}") from None
+        # A state that blows up is a fall, not a reset in silence.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.data = mujoco.MjData(model)
+        joints = [model.joint(name) for name in policy.joint_names]
+        self._qpos = np.array([joint.qposadr[0] for joint in joints])
+        self._qvel = np.array([joint.dofadr[0] for joint in joints])
+        ids = [joint.id for joint in joints]
+        servo = {int(j): i for i, (j, _) in enumerate(model.actuator_trnid) if drives_joint(model, i)}
+        if own_gains:
+            check_servos(model, {name: servo.get(i) for name, i in zip(policy.joint_names, ids, strict=True)}, path)
+        self._servo = np.array([servo[i] for i in ids])
+        free = int(np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)[0])
+        self._root, self._root_body = int(model.jnt_qposadr[free]), int(model.jnt_bodyid[free])
+        self._root_dof = int(model.jnt_dofadr[free])
+        if model.opt.timestep > policy.step_dt * 1.001:
+            raise UserError(
+                f"{path} has a time step of {model.opt.timestep:g} s: expected at most {policy.step_dt:g} s, of control"
+            )
+        self.substeps = max(1, round(policy.step_dt / model.opt.timestep))
+        self._key_points = [(self._body(p, path), p["offset"]) for p in policy.key_points]
+        self._falls = [(self._body(s, path), s["ends"], s["radius"]) for s in policy.fall_shapes]
+        self.time, self.raised = 0.0, 0.0
+        self.command, self.action = np.zeros(3), np.zeros(len(ids))
+        self.reset()
+        for name, width in policy.terms.items():
+            if (found := np.size(TERMS[name](self))) != width:
+                raise UserError(f"the policy's {name} has {width} numbers: expected {found}, as sim2sim makes them")
+        self.differences = said + differences(policy, model, ids, self._servo, self._root_body, self.substeps)
+        if self.raised:
+            self.differences.append(f"the soles reach lower: the start is raised by {1e3 * self.raised:.1f} mm")
+
+    def _body(self, place: dict[str, Any], path: str | Path) -> int:
+        """Index of a body: its hinge finds it, whatever the model calls it."""
+        if place["joint"] is not None:
+            return int(self.model.joint(place["joint"]).bodyid[0])
+        found = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, place["body"])
+        if found < 0:
+            raise UserError(f"{path} has no body {place['body']!r}: the policy's robot has one")
+        return found
+
+    def reset(self, noise: np.ndarray | None = None) -> None:
+        """The policy's default pose at rest; ``noise [2, J]`` is added to angles (rad) and velocities (rad/s)."""
+        data, angles = self.data, self.policy.default_qpos
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[self._root : self._root + 7] = angles[:7]
+        data.qpos[self._qpos] = angles[7:]
+        if noise is not None:
+            data.qpos[self._qpos] += noise[0]
+            data.qvel[self._qvel] += noise[1]
+        mujoco.mj_fwdPosition(self.model, data)
+        static = self.model.body_weldid[self.model.geom_bodyid[data.contact.geom]] == 0
+        depth = -data.contact.dist[static.any(-1)].min(initial=0.0)
+        self.raised = float(depth - _DEEPEST) if depth > _DEEPEST else 0.0
+        data.qpos[self._root + 2] += self.raised
+        mujoco.mj_kinematics(self.model, data)
+        self.time, self.action = 0.0, np.zeros(len(self._qpos))
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """Configuration in the policy's order, ``[7 + J]``."""
+        return np.concatenate([self.data.qpos[self._root : self._root + 7], self.data.qpos[self._qpos]])
+
+    @property
+    def qvel(self) -> np.ndarray:
+        """Velocities in the policy's order, ``[6 + J]``: the root's in the world, its turning in its own axes."""
+        return np.concatenate([self.data.qvel[self._root_dof : self._root_dof + 6], self.data.qvel[self._qvel]])
+
+    @property
+    def axes(self) -> np.ndarray:
+        """The root's axes in the world, the columns of ``[3, 3]``."""
+        return self.data.xmat[self._root_body].reshape(3, 3)
+
+    def key_points(self) -> np.ndarray:
+        """Key points less the root, in the world's axes, ``[K, 3]`` m."""
+        root = self.data.xpos[self._root_body]
+        return np.array([self._point(body, offset) - root for body, offset in self._key_points])
+
+    def _point(self, body: int, offset: np.ndarray) -> np.ndarray:
+        return self.data.xpos[body] + offset @ self.data.xmat[body].reshape(3, 3).T
+
+    def observe(self) -> np.ndarray:
+        """The policy's observation, ``[O]``."""
+        return np.concatenate([np.ravel(TERMS[name](self)) for name in self.policy.terms])
+
+    def step(self) -> bool:
+        """One step of control; whether a body that marks a fall then touches the floor."""
+        self.action = self.policy.act(self.observe())
+        self.data.ctrl[self._servo] = self.policy.center + self.policy.scale * self.action
+        mujoco.mj_step(self.model, self.data, self.substeps)
+        self.time = self.data.time
+        if not np.isfinite(self.data.qpos).all():
+            return True
+        mujoco.mj_kinematics(self.model, self.data)
+        return any((self._point(body, ends)[:, 2] < radius).any() for body, ends, radius in self._falls)
+
+    def velocity(self) -> np.ndarray:
+        """Velocity of the root forward and to the left in its own heading (m/s), and its turn (rad/s), ``[3]``."""
+        x, y = self.axes[:2, 0] / max(np.linalg.norm(self.axes[:2, 0]), 1e-6)
+        forward, left = np.array([[x, y], [-y, x]]) @ self.qvel[:2]
+        return np.array([forward, left, (self.axes @ self.qvel[3:6])[2]])

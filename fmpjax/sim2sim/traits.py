@@ -1,0 +1,46 @@
+"""What tells two models of one robot apart."""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+
+def integrator(model: mujoco.MjModel | mujoco.MjSpec) -> str:
+    """MuJoCo's name of the integrator of a model."""
+    option = model.opt if isinstance(model, mujoco.MjModel) else model.option
+    return mujoco.mjtIntegrator(option.integrator).name.removeprefix("mjINT_").lower()
+
+
+# What `facts` says: its words, its unit, and the difference from which it is told.
+FACTS = {
+    "joint_places": ("places", "m", 1e-4),
+    "joint_directions": ("directions", "", 1e-3),
+    "joint_loads": ("loads", "kg", 1e-3),
+    "joint_armature": ("armature", "kg m^2", 1e-6),
+    "joint_friction": ("friction", "N m", 1e-6),
+    "joint_passive_damping": ("damping of its own", "N m s/rad", 1e-6),
+}
+
+
+def facts(model: mujoco.MjModel, joint_names: Sequence[str]) -> dict[str, np.ndarray]:
+    """What tells two models of one robot apart, joint by joint, at angles of zero; names of bodies do not matter.
+
+    Places of the joints less the root's (m) and their directions in its axes, ``[J, 3]``; the mass that each carries
+    (kg), armature (kg m²), dry friction (N m) and damping of the joint itself (N m s/rad), ``[J]``.
+    """
+    data = mujoco.MjData(model)
+    joints = [model.joint(name) for name in joint_names]
+    ids, dofs = [joint.id for joint in joints], [joint.dofadr[0] for joint in joints]
+    data.qpos[[joint.qposadr[0] for joint in joints]] = 0.0
+    mujoco.mj_kinematics(model, data)
+    root = model.jnt_bodyid[np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)[0]]
+    axes = data.xmat[root].reshape(3, 3)
+    return {
+        "joint_places": (data.xanchor[ids] - data.xpos[root]) @ axes,
+        "joint_directions": data.xaxis[ids] @ axes,
+        "joint_loads": model.body_subtreemass[model.jnt_bodyid[ids]],
+        "joint_armature": model.dof_armature[dofs],
+        "joint_friction": model.dof_frictionloss[dofs],
+        "joint_passive_damping": model.dof_damping[dofs],
+    }
