@@ -21,11 +21,11 @@ option = $(if $($(1)),--$(2) '$($(1))')
 train_options = $(strip \
   $(call option,METHOD,method) $(call option,RESET,reset) $(call option,PRESET,preset) \
   $(call option,ROBOT,robot) $(call option,MOTION,motion) $(call option,FRAMES,frames) \
-  $(call option,SEED,seed) $(call option,SEEDS,seeds) $(call option,RUN,run) $(call option,MINUTES,minutes) \
+  $(call option,COMMAND,command) $(call option,SEED,seed) $(call option,SEEDS,seeds) $(call option,RUN,run) $(call option,MINUTES,minutes) \
   $(if $(filter-out 0 no false,$(RESUME)),--resume) $(ARGS))
 
 # A variable that is given on the command line and read by none of the targets is a slip: training would go on without it.
-known_train := METHOD RESET PRESET ROBOT MOTION FRAMES SEED SEEDS RUN MINUTES RESUME ARGS
+known_train := METHOD RESET PRESET ROBOT MOTION COMMAND FRAMES SEED SEEDS RUN MINUTES RESUME ARGS
 known_evaluate := RUN ARGS
 known_render := RUN ARGS
 known_test := WORKERS ARGS
@@ -43,7 +43,7 @@ endif
 
 .PHONY: train evaluate render test test-fast coverage check format build clean help run-is-named
 
-train: $(READY) ## train a policy: METHOD RESET PRESET ROBOT MOTION FRAMES SEED SEEDS RUN MINUTES RESUME=1
+train: $(READY) ## train a policy: METHOD RESET PRESET ROBOT MOTION COMMAND FRAMES SEED SEEDS RUN MINUTES RESUME=1
 	$(BIN)/fmpjax train $(train_options)
 
 evaluate: run-is-named $(READY) ## evaluate a run: RUN=runs/walk

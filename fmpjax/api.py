@@ -8,12 +8,14 @@ from fmpjax import config as configuration
 from fmpjax import runs
 from fmpjax.config import Config
 from fmpjax.errors import UserError
+from fmpjax.motion import library
 from fmpjax.runs import Run
 
 
 def train(
     config: Config | None = None,
     *,
+    command: str | None = None,
     preset: str | None = None,
     folder: str | Path | None = None,
     minutes: float | None = None,
@@ -27,6 +29,7 @@ def train(
 
     Args:
       config: the settings; by default those of ``preset``.
+      command: what the policy is told, "none", "velocity" or "phase"; docs/steering.md.
       preset: the name of a preset; by default `laptop` on a CPU and `paper` on an accelerator.
       folder: the run folder; by default ``runs/METHOD-DATE-TIME``.
       minutes: time that the training may take, its compilation and evaluations included.
@@ -44,11 +47,11 @@ def train(
     if minutes is not None and not minutes > 0:
         raise UserError(f"minutes is {minutes:g}: expected more than 0")
     if resume:
-        if folder is None or config or preset or settings:
+        if folder is None or config or command or preset or settings:
             raise UserError("resume continues a run with its own settings: expected its folder and no settings")
         run = Run.open(folder)
     else:
-        run = _created(config, preset, folder, settings)
+        run = _created(config, preset, folder, configuration.commanded(command, settings))
     left = None if minutes is None else minutes - (time.monotonic() - began) / 60
     if runs.train(run, resume=resume, minutes=left) is not runs.End.SIGNAL:
         runs.finish(run)
@@ -63,6 +66,7 @@ def _created(config: Config | None, preset: str | None, folder: str | Path | Non
         raise UserError(f"config is {config!r} and preset is {preset!r}: expected a Config or the name of a preset")
     else:
         config = configuration.validate(configuration.with_changes(config, settings))
+    config = configuration.with_changes(config, {"motion": library.listed(config.motion)})
     runs.check_trainable(config)
     print(runs.describe(config), flush=True)
     return Run.create(folder or runs.default_folder(config), config)

@@ -43,7 +43,9 @@ class Train:
     robot: Annotated[str | None, _setting("robot")] = None
     """A robot under robots/."""
     motion: Annotated[str | None, _setting("motion")] = None
-    """A bundled motion's name or a file; several with weights as NAME[:WEIGHT],NAME[:WEIGHT]."""
+    """A bundled motion's name, a file or a folder of files; several with weights as NAME[:WEIGHT],NAME[:WEIGHT]."""
+    command: Annotated[str | None, default("none, or the run's own with --resume")] = None
+    """What the policy is told: `none`, `velocity` (by default of the motions `gaits`) or `phase`; docs/steering.md."""
     frames: Annotated[str | None, default("all")] = None
     """Source rows first:last of the motion, 0-based, both included; of several motions with commas between them."""
     seed: Annotated[int | None, _setting("seed")] = None
@@ -185,12 +187,19 @@ class Train:
             "seed": self.seed,
             "transitions": self.transitions,
         }
-        changes = {key: value for key, value in named.items() if value is not None}
+        from fmpjax.motion import library
+
+        changes: dict[str, object] = {key: value for key, value in named.items() if value is not None}
         for item in self.set:
             key, equals, value = item.partition("=")
             if not equals or key == "preset":
                 raise UserError(f"--set {item!r}: expected section.field=value")
             changes[key] = value
+        if self.resume:
+            return changes | ({} if self.command is None else {"command.kind": self.command})
+        changes = configuration.commanded(self.command, changes)
+        if isinstance(names := changes.get("motion"), str):
+            changes["motion"] = library.listed(names)
         return changes
 
 
@@ -260,14 +269,14 @@ class Export:
 
     def __call__(self) -> None:
         runs = _runs()
-        from fmpjax import deploy, robots
+        from fmpjax import deploy, features, robots
 
         run = runs.Run.open(self.run)
         for path in runs.export(run, self.out, onnx=self.onnx):
             print(f"wrote {path}")
         config = run.config
         for say in (deploy.unmeasured, deploy.no_stock) if self.onnx else ():
-            if sentence := say(robots.load(config.robot), config.env.observation):
+            if sentence := say(robots.load(config.robot), features.observation_form(config)):
                 print(f"note: {sentence}")
 
 

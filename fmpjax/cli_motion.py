@@ -1,6 +1,7 @@
 """The commands under ``fmpjax motion``; another one is another class in `MOTION`."""
 
 import dataclasses
+import itertools
 import math
 import sys
 from pathlib import Path
@@ -201,10 +202,16 @@ class _Style(Style):
 
 @dataclasses.dataclass(frozen=True)
 class Synthesize:
-    """Write a steady walk of our own; --speed 0 alone is standing."""
+    """Write a steady walk of our own; --speed 0 alone is standing. With --grid, a library of them."""
 
     out: Path
-    """File to write, .npz."""
+    """File to write, .npz; a folder with --grid."""
+    grid: bool = False
+    """Write a walk for each combination of --speeds and --turns that the legs reach."""
+    speeds: tuple[float, ...] = (0.0, 0.4, 0.8, 1.2)
+    """Of the grid, ahead, m/s."""
+    turns: tuple[float, ...] = (-0.8, -0.4, 0.0, 0.4, 0.8)
+    """Of the grid, to the left, rad/s."""
     speed: Annotated[float | None, default("the robot's own")] = None
     """Ahead, m/s, negative backward."""
     sideways: float = 0.0
@@ -222,11 +229,27 @@ class Synthesize:
 
     def __call__(self) -> None:
         robot = robots.load(self.robot)
+        if self.grid:
+            return self._grid(robot)
         speed = robot.gait.get("speed", 0.0) if self.speed is None else self.speed
         walk = gait.make(robot, gait.Command(speed, self.sideways, self.turn), rate=self.rate, style=self.style)
         clip = walk.clip(self.duration)
         print(walk.said())
         print(f"wrote {motion.save(clip, self.out)}: {clip.duration:.2f} s")
+
+    def _grid(self, robot: robots.Robot) -> None:
+        """Write the library; what is out of reach is said and left out."""
+        if self.out.suffix:
+            raise UserError(f"--out is {self.out}: expected a folder with --grid")
+        self.out.mkdir(parents=True, exist_ok=True)
+        for speed, turn in itertools.product(self.speeds, self.turns):
+            try:
+                walk = gait.make(robot, gait.Command(speed, self.sideways, turn), rate=self.rate, style=self.style)
+            except gait.OutOfReach as refused:
+                print(f"left out: {refused}")
+                continue
+            path = self.out / f"{speed:+.2f}_{turn:+.2f}.npz"
+            print(f"wrote {motion.save(walk.clip(self.duration), path)}", flush=True)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,13 +7,13 @@ construction.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import features, physics, sharding
+from fmpjax import commands, features, physics, sharding
 from fmpjax.acting import Policy
 from fmpjax.config import Config
 from fmpjax.features import Observed
@@ -26,7 +26,7 @@ _LIMITS = physics.PhysicsState(qpos=np.inf, qvel=1e3, warmstart=np.inf)  # m and
 
 
 # Fields of `EnvState` with a leading axis of environments.
-PER_ENVIRONMENT = ("physics", "observed", "history", "age")
+PER_ENVIRONMENT = ("physics", "observed", "history", "age", "command")
 
 
 class Offender(NamedTuple):
@@ -48,6 +48,7 @@ class EnvState(NamedTuple):
     capped_share: jax.Array  # scalar, running share of episodes that end by the cap
     cap_age: jax.Array  # scalar int32, rollouts since the cap last grew
     offender: Offender
+    command: Any = ()  # each environment's, as its kind has it; nothing without commands
 
 
 class Moment(NamedTuple):
@@ -58,6 +59,7 @@ class Moment(NamedTuple):
     age: jax.Array  # [N] int32, steps since the reset
     window: jax.Array  # [N, H] int32, frame table's rows of the frames up to the present one, oldest first
     offender: Offender  # each environment's own in this rollout, [N, ...]
+    command: Any = ()  # each environment's
 
 
 class Drawn(NamedTuple):
@@ -67,6 +69,7 @@ class Drawn(NamedTuple):
     start: jax.Array  # [N] int32, frame table's rows of the states at which new episodes begin
     window: jax.Array  # [N, H] int32, frame table's rows of the histories up to there
     key: jax.Array  # of the noise on those states
+    command: Any = ()  # random numbers of the commands
 
 
 class Reached(NamedTuple):
@@ -91,6 +94,7 @@ class Steps(NamedTuple):
     length: jax.Array  # [T, N] int32, steps of the episode up to and including this one
     frame: jax.Array  # [T, N, F] compact frame after the step, before any reset
     window: jax.Array  # [T, N, H] int32 indices into the frame table
+    command: Any = ()  # in force during the step
 
 
 class ActionMap(NamedTuple):
@@ -127,7 +131,8 @@ class Env:
         self.horizon = config.features.history
         library = MotionLibrary.of(motion)
         self.actions = action_map(robot, library, config.env.action)
-        observe = jax.jit(lambda qpos, qvel: features.observe(robot, qpos, qvel, config.env.observation))
+        self.form = features.observation_form(config)
+        observe = jax.jit(lambda qpos, qvel: features.observe(robot, qpos, qvel, self.form))
         self._observe = observe
         # A row stands `stride` rows after the frame before it.
         self.stride = config.env.demonstration_parts
@@ -141,15 +146,27 @@ class Env:
         self._qvel = np.concatenate([library.qvel, np.zeros_like(library.qvel[:1])]).astype(np.float32)
         self._table = jax.tree.map(np.asarray, observe(jnp.asarray(self._qpos), jnp.asarray(self._qvel)))
         self.clip_rows = len(library.qpos)
+        self.command = commands.make(config, robot, library, self._table.frame)
 
     @property
     def observation_size(self) -> int:
-        return self._table.actor.shape[-1]
+        return self._table.actor.shape[-1] + (self.command.size if self.command else 0)
 
     @property
-    def clip_observations(self) -> np.ndarray:
+    def clip_observations(self) -> jax.Array:
         """Policy observations of the demonstrations, ``[M, O]``."""
-        return self._table.actor[:-1]
+        rows = jnp.arange(self.clip_rows)
+        return self.seen(jnp.asarray(self._table.actor)[rows], self.first_command(rows))
+
+    def seen(self, actor: jax.Array, command: Any) -> jax.Array:
+        """What the networks observe, ``[..., O]``: the robot, and the command where there is one."""
+        return jnp.concatenate([actor, self.command.observe(command)], axis=-1) if self.command else actor
+
+    def first_command(self, rows: jax.Array, key: jax.Array | None = None) -> Any:
+        """Commands of episodes that begin at the table rows ``[N]``."""
+        if not self.command:
+            return ()
+        return self.command.begin(rows, self.command.draw(jax.random.PRNGKey(0) if key is None else key, rows.shape))
 
     def clip_windows(self) -> jax.Array:
         """The demonstrations' windows of compact frames, ``[W, H, F]``."""
@@ -214,6 +231,7 @@ class Env:
             offender=Offender(
                 *(jnp.zeros(n) for n in (state.qpos.shape[-1], state.qvel.shape[-1], len(self.actions.low)))
             ),
+            command=self.first_command(rows, None if key is None else jax.random.fold_in(key, 3)),
         )
 
     def reset(self, key: jax.Array) -> EnvState:
@@ -228,7 +246,7 @@ class Env:
 
         def play(now: Moment, inputs) -> tuple[Moment, Steps]:
             noise, drawn = inputs
-            action, extras = policy.act(now.observed.actor, noise)
+            action, extras = policy.act(self.seen(now.observed.actor, now.command), noise)
             now, record = self.step(now, action, drawn, state.cap)
             return now, record._replace(extras=extras)
 
@@ -241,16 +259,18 @@ class Env:
             start=starts,
             window=jax.vmap(self.history_rows)(starts),
             key=jax.vmap(lambda key: jax.random.fold_in(key, 2))(reset_keys),
+            command=self._command_draws(reset_keys, count),
         )
         window = before + jnp.arange(count * self.horizon).reshape(count, self.horizon)
         offender = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), state.offender)
-        now = Moment(state.physics, state.observed, state.age, window, offender)
+        now = Moment(state.physics, state.observed, state.age, window, offender, state.command)
         now, record = jax.lax.scan(play, now, (noise, drawn))
         new_state = state._replace(
             physics=now.physics,
             observed=now.observed,
             history=self.frame_table(state, record)[now.window],
             age=now.age,
+            command=now.command,
             offender=_last_offender(now.offender, record.nonfinite, state.offender),
         )
         return self._grow_cap(new_state, record), record
@@ -270,10 +290,14 @@ class Env:
         reached = self.advance(now.physics, action)
         age = now.age + 1
         timed_out = (age >= cap) & ~reached.fell
+        command = ()
+        if self.command:
+            command, over = self.command.advance(now.command, drawn.command)
+            timed_out |= over & ~reached.fell
         window = sharding.split(jnp.concatenate([now.window[:, 1:], drawn.row[:, None]], axis=1))
         record = Steps(
-            observation=now.observed.actor,
-            next_observation=reached.observed.actor,
+            observation=self.seen(now.observed.actor, now.command),
+            next_observation=self.seen(reached.observed.actor, command),
             action=action,
             extras={},
             fell=reached.fell,
@@ -282,13 +306,21 @@ class Env:
             length=age,
             frame=reached.observed.frame,
             window=window,
+            command=now.command,
         )
         done = reached.fell | timed_out
         sim, observed = self._begin(drawn.start, drawn.key)
-        begun = sim, observed, jnp.zeros_like(age), drawn.window
-        after = reached.physics, reached.observed, age, window
-        kept = jax.tree.map(lambda new, old: jnp.where(_over(done, old), new, old), begun, after)
-        return Moment(*kept, offender=_offender(now, action, reached.finite)), record
+        fresh = self.command.begin(drawn.start, drawn.command) if self.command else ()
+        begun = sim, observed, jnp.zeros_like(age), drawn.window, fresh
+        after = reached.physics, reached.observed, age, window, command
+        *kept, command = jax.tree.map(lambda new, old: jnp.where(_over(done, old), new, old), begun, after)
+        return Moment(*kept, offender=_offender(now, action, reached.finite), command=command), record
+
+    def _command_draws(self, keys: jax.Array, count: int) -> Any:
+        """Random numbers of the commands of all steps, which have a key each."""
+        if not self.command:
+            return ()
+        return jax.vmap(lambda key: self.command.draw(jax.random.fold_in(key, 3), (count,)))(keys)
 
     def advance(self, sim: physics.PhysicsState, action: jax.Array) -> Reached:
         """The physics of one control step under normalised actions ``[N, J]``, whatever the episodes."""

@@ -178,12 +178,15 @@ class Evaluator:
         policy = self.trainer.ppo.act(state, deterministic=True)
 
         def step(carry, _):
-            sim, observed, alive, length = carry
+            sim, observed, command, alive, fell, length = carry
             with self.trainer.precision():
-                action, _ = policy(observed.actor, None)
+                action, _ = policy(env.seen(observed.actor, command), None)
             reached = env.advance(sim, action)
+            fell, length = fell | (alive & reached.fell), length + alive
             still_alive = alive & ~reached.fell
-            length = length + alive
+            if env.command:  # it stays what it was at the start, and may end the episode
+                command, over = env.command.advance(command, None)
+                still_alive &= ~over
 
             def hold(new, old):
                 # The step on which a robot falls is part of its episode; after it nothing moves.
@@ -191,16 +194,17 @@ class Evaluator:
 
             sim = jax.tree.map(hold, reached.physics, sim)
             observed = jax.tree.map(hold, reached.observed, observed)
-            return (sim, observed, still_alive, length), (sim.qpos[:headline], sim.qvel[:headline])
+            return (sim, observed, command, still_alive, fell, length), (sim.qpos[:headline], sim.qvel[:headline])
 
         alive = jnp.ones(len(self.rows), bool)
         carry, (qpos, qvel) = jax.lax.scan(
             step,
-            (start.physics, start.observed, alive, jnp.zeros(len(self.rows), jnp.int32)),
+            (start.physics, start.observed, start.command, alive, ~alive, jnp.zeros(len(self.rows), jnp.int32)),
             None,
             length=env.config.episode_steps,
         )
-        return qpos, qvel, carry[3], ~carry[2], start.physics.qpos, start.history
+        *_, fell, length = carry
+        return qpos, qvel, length, fell, start.physics.qpos, start.history
 
     def play(self, state: PPOState) -> Episodes:
         """First episodes under ``state``'s mean action."""

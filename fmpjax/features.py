@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fmpjax import kinematics, rotations
-from fmpjax.config import FeatureConfig
+from fmpjax.config import Config, FeatureConfig
 from fmpjax.errors import UserError
 from fmpjax.frames import FORWARD, PLANAR, FrameLayout
 from fmpjax.robots import Robot
@@ -91,27 +91,52 @@ def actor_observation(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Arr
     return _observation(robot, _parts(robot, qpos, qvel), "full")
 
 
-def observation_terms(robot: Robot, observation: str) -> dict[str, int]:
-    """Names and widths of the parts of the policy's observation, in their order."""
-    joints = robot.joint_count
-    angles = {"joint_rotation_6d": 6 * _rotations(robot)} if observation == "full" else {"joint_position": joints}
-    root = {"root_height": 1, "root_rotation_6d": 6, "root_linear_velocity": 3, "root_angular_velocity": 3}
-    return root | angles | {"joint_velocity": joints, "key_points": 3 * len(robot.key_body)}
+def observation_form(config: Config) -> str:
+    """What the policy of a configuration observes, in words such as "compact" or "compact heading velocity"."""
+    words = [config.env.observation, config.env.axes, config.command.kind]
+    return " ".join(word for word in words if word not in ("world", "none"))
 
 
-def _observation(robot: Robot, p: _Parts, observation: str) -> jax.Array:
+COMMAND_TERMS = {"velocity": {"velocity_commands": 3}, "phase": {"clip_phase": 5}}
+
+
+def observation_terms(robot: Robot, form: str) -> dict[str, int]:
+    """Names and widths of the parts of the policy's observation, in their order.
+
+    Args:
+      robot: that is observed.
+      form: as `observation_form` gives it.
+    """
+    content, *more = form.split()
+    joints, axes = robot.joint_count, "heading" if "heading" in more else "root"
+    angles = {"joint_rotation_6d": 6 * _rotations(robot)} if content == "full" else {"joint_position": joints}
+    root = {"root_height": 1, f"{axes}_rotation_6d": 6, f"{axes}_linear_velocity": 3, f"{axes}_angular_velocity": 3}
+    points = {"heading_key_points" if "heading" in more else "key_points": 3 * len(robot.key_body)}
+    terms = root | angles | {"joint_velocity": joints} | points
+    for word in more:
+        terms |= COMMAND_TERMS.get(word, {})
+    return terms
+
+
+def _observation(robot: Robot, p: _Parts, form: str) -> jax.Array:
+    own = _turned(p)
     parts = {
         "root_height": p.root[..., 2:],
         "root_rotation_6d": p.rotation,
         "root_linear_velocity": p.velocity,
         "root_angular_velocity": p.angular_velocity,
+        "heading_rotation_6d": own.rotation,
+        "heading_linear_velocity": own.velocity,
+        "heading_angular_velocity": own.angular_velocity,
         "joint_position": p.joints,
         "joint_velocity": p.joint_velocity,
         "key_points": p.key_points,
+        "heading_key_points": own.key_points,
     }
-    if observation == "full":
+    if form.startswith("full"):
         parts["joint_rotation_6d"] = _joint_rotations(robot, p.joints)
-    return jnp.concatenate([parts[name] for name in observation_terms(robot, observation)], axis=-1)
+    # Of the command the environment has to add its own.
+    return jnp.concatenate([parts[name] for name in observation_terms(robot, form) if name in parts], axis=-1)
 
 
 def prior_window(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
@@ -150,8 +175,24 @@ class Observed(NamedTuple):
     fallen: jax.Array  # [...] bool
 
 
-def observe(robot: Robot, qpos: jax.Array, qvel: jax.Array, observation: str) -> Observed:
-    """The policy's observation, the compact frame and the fall test of states ``qpos``, ``qvel``."""
+def _turned(p: _Parts) -> _Parts:
+    """The same in axes of which x points where the root faces."""
+    forward = p.rotation[..., :2]
+    cosine, sine = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
+
+    def turn(vectors):
+        x, y, z = (vectors[..., i::3] for i in range(3))
+        return jnp.stack([x * cosine + y * sine, y * cosine - x * sine, z], axis=-1).reshape(vectors.shape)
+
+    names = ("rotation", "velocity", "angular_velocity", "key_points")
+    return p._replace(**{name: turn(getattr(p, name)) for name in names})
+
+
+def observe(robot: Robot, qpos: jax.Array, qvel: jax.Array, form: str) -> Observed:
+    """The policy's observation, the compact frame and the fall test of states ``qpos``, ``qvel``.
+
+    The observation is of the robot alone, in the ``form`` that `observation_form` names, without the command.
+    """
     poses = kinematics.body_poses(robot, qpos)
     p = _parts(robot, qpos, qvel, poses)
     frame = FrameLayout.join(
@@ -164,7 +205,7 @@ def observe(robot: Robot, qpos: jax.Array, qvel: jax.Array, observation: str) ->
         angular_velocity=p.angular_velocity,
         joint_velocity=p.joint_velocity,
     )
-    return Observed(_observation(robot, p, observation), frame, kinematics.fallen(robot, poses))
+    return Observed(_observation(robot, p, form), frame, kinematics.fallen(robot, poses))
 
 
 def _rotations(robot: Robot) -> int:

@@ -23,7 +23,7 @@ class Policy(NamedTuple):
     """The mean action of a trained policy, as joint targets."""
 
     joint_names: tuple[str, ...]  # J, the order of targets
-    observation: str  # "compact" or "full", what `features.observe` makes
+    observation: str  # such as "compact", as `features.observation_form` names it
     rate: float  # Hz, of control
     activation: str
     kernels: tuple[np.ndarray, ...]  # of the layers, [in, out]
@@ -67,7 +67,7 @@ def of(trainer: "Trainer", state: "PPOState") -> Policy:
     kernels, biases = zip(*trainer.ppo.layers(state.actor), strict=True)
     return Policy(
         joint_names=tuple(robot.joint_names),
-        observation=config.env.observation,
+        observation=trainer.env.form,
         rate=float(config.control_rate),
         activation=config.ppo.activation,
         kernels=kernels,

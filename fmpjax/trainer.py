@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from fmpjax import features, learning, metrics, physics, priors, robots, sharding
+from fmpjax import commands, features, learning, metrics, physics, priors, robots, sharding
 from fmpjax.config import Config
 from fmpjax.env import PER_ENVIRONMENT, Env, EnvState, Steps
 from fmpjax.errors import UserError
@@ -109,6 +109,7 @@ class Trainer:
         prior, reward, prior_metrics = self.prior.update(
             state.prior, priors.Rollout(windows, ~steps.nonfinite, steps.length == 1), prior_key
         )
+        reward, command_metrics = self._commanded(steps, reward)
         ppo, ppo_metrics = self.ppo.update(state.ppo, _batch(steps, reward), ppo_key)
         skipped = prior_metrics.get("skipped", 0.0) + ppo_metrics["skipped"]
         nonfinite = state.nonfinite + steps.nonfinite.sum().astype(jnp.int32) + jnp.int32(skipped)
@@ -117,10 +118,19 @@ class Trainer:
             | {f"env/{name}": getattr(env, name) for name in ("cap", "capped_share")}
             | {f"fit/{name}": value for name, value in prior_metrics.items()}
             | {f"ppo/{name}": value for name, value in ppo_metrics.items()}
+            | command_metrics
             | {"train/nonfinite": nonfinite}
         )
         figures = {name: jnp.asarray(value, jnp.float32) for name, value in figures.items()}
         return TrainState(ppo, prior, env, key, state.iteration + 1, nonfinite), figures
+
+    def _commanded(self, steps: Steps, reward: jax.Array) -> tuple[jax.Array, Metrics]:
+        """The prior's reward ``[T, N]`` joined by what the steps earn by obeying, where they are told anything."""
+        if not self.env.command:
+            return reward, {}
+        obeyed = self.env.command.reward(steps.command, steps.frame)
+        measured = {"command/reward": obeyed.mean(), "command/prior_reward": reward.mean()}
+        return commands.combine(self.config.command, reward, obeyed), measured
 
     def compile(self, state: TrainState) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
         """The compiled program of a run: ``config.chunk`` iterations, metrics averaged over them.

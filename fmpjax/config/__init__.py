@@ -4,12 +4,13 @@ Numbers that cannot be set stand where they are used. They define a figure (at t
 part of a formula (in `env`, `ppo`, `features`, `transport`, `potential` and `priors`) or size a study (`experiments`).
 """
 
-from fmpjax.config.presets import DESCRIPTIONS, PRESETS, preset
+from fmpjax.config.presets import COMMANDS, DESCRIPTIONS, PRESETS, commanded, preset
 from fmpjax.config.reading import flatten, from_json, read, to_json, validate, with_changes
 from fmpjax.config.sections import (
     SMP_NETWORKS,
     AdversaryConfig,
     AMPConfig,
+    CommandConfig,
     Config,
     EnvConfig,
     FeatureConfig,
@@ -23,11 +24,13 @@ from fmpjax.config.sections import (
 )
 
 __all__ = [
+    "COMMANDS",
     "DESCRIPTIONS",
     "PRESETS",
     "SMP_NETWORKS",
     "AMPConfig",
     "AdversaryConfig",
+    "CommandConfig",
     "Config",
     "EnvConfig",
     "FeatureConfig",
@@ -38,6 +41,7 @@ __all__ = [
     "PriorConfig",
     "SMPConfig",
     "WAILConfig",
+    "commanded",
     "flatten",
     "from_json",
     "preset",

@@ -108,6 +108,36 @@ _SMOKE: dict[str, Any] = _LAPTOP | {
     "ppo.hidden": (64, 64),
 }
 
+# What goes with a command unless it is set otherwise: neither the policy nor the prior knows which way is north.
+COMMANDS: Mapping[str, Mapping[str, Any]] = {
+    "none": {},
+    "velocity": {
+        "command.kind": "velocity",
+        "motion": "gaits",
+        "env.axes": "heading",
+        "features.axes": "heading",
+    },
+    "phase": {"command.kind": "phase", "env.axes": "heading", "features.axes": "heading"},
+}
+
+
+def commanded(kind: str | None, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Changes of the settings with those that go with a command; what is changed itself stays.
+
+    Args:
+      kind: of command; None leaves the command as it is.
+      changes: by ``section.field`` keys.
+
+    Raises:
+      UserError: the kind is unknown.
+    """
+    if kind is None:
+        return dict(changes)
+    if kind not in COMMANDS:
+        raise UserError(f"command is {kind!r}: expected one of {', '.join(COMMANDS)}")
+    return {**COMMANDS[kind], **changes}
+
+
 PRESETS: Mapping[str, Mapping[str, Any]] = {"smoke": _SMOKE, "laptop": _LAPTOP, "paper": {}}
 DESCRIPTIONS = {
     "smoke": "the whole path in a minute; learns nothing",

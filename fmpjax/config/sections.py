@@ -75,6 +75,9 @@ class EnvConfig(Section):
     cap_share: NonNegativeFloat = 0.75  # share of episodes that end by the cap above which the cap grows [D]
     cap_patience: NonNegativeInt = 25  # rollouts between two growth steps at least [D]
     observation: Literal["full", "compact"] = "full"  # 237 numbers [P], or 86 that carry the same information [D]
+    axes: Literal["world", "heading"] = (
+        "world"  # of an observation's vectors [P]; "heading": x where the root faces [D]
+    )
     # 1.4 max|limit| around zero [M], or "residual": 0.25 effort/kp around the demonstration's mean pose [D]
     action: Literal["absolute", "residual"] = "absolute"
 
@@ -82,6 +85,46 @@ class EnvConfig(Section):
     def longest_episode(self) -> int:
         """Control steps of the longest episode in training."""
         return max(self.first_cap, min(self.last_cap, self.episode_steps))
+
+
+@dataclasses.dataclass(frozen=True)
+class CommandConfig(Section):
+    """What the policy is told, and what a step earns by obeying."""
+
+    # nothing [P], a velocity in the heading frame, or the time in the clip ("phase") [D]
+    kind: Literal["none", "velocity", "phase"] = "none"
+    combine: Literal["product", "sum"] = "product"  # of the reward of the motion and that of the command [D]
+    weight: PositiveFloat = 1.0  # of the command's reward in a sum [D]
+    hold: tuple[float, ...] = (1.0, 3.0)  # s, shortest and longest time for which a velocity is held [D]
+    zero: NonNegativeFloat = 0.1  # share of the new velocities that are zero [D]
+    # m/s, slowest and fastest velocity ahead; empty, with the next two, for the demonstrations' own velocities [D]
+    ahead: tuple[float, ...] = ()
+    sideways: tuple[float, ...] = ()  # m/s, the same to the left; empty for none where another range is given [D]
+    turn: tuple[float, ...] = ()  # rad/s, the same of turning to the left [D]
+    speed_width: PositiveFloat = 0.5  # m/s, error at which the reward of the speed falls to 1/e [D]
+    turn_width: PositiveFloat = 0.5  # rad/s, error at which the reward of the turning falls to 1/e [D]
+    turn_share: Fraction = 0.25  # of the turning in the reward [D]
+
+    @property
+    def ranges(self) -> tuple[tuple[float, ...], ...] | None:
+        """Ends of the velocity's three components, ``[3, 2]``; None for the demonstrations' own velocities."""
+        given = (self.ahead, self.sideways, self.turn)
+        return tuple(ends or (0.0, 0.0) for ends in given) if any(given) else None
+
+    def check(self) -> None:
+        """Raise a `UserError` where a range is none."""
+        for name in ("hold", "ahead", "sideways", "turn"):
+            ends = getattr(self, name)
+            if (ends or name == "hold") and not (len(ends) == 2 and ends[0] <= ends[1]):
+                raise UserError(
+                    f"setting command.{name} is {', '.join(f'{end:g}' for end in ends) or 'empty'}: expected two "
+                    "numbers, the lower one first"
+                )
+        if not (self.hold[0] > 0 and self.zero <= 1):
+            name, value = ("zero", self.zero) if self.hold[0] > 0 else ("hold", self.hold[0])
+            raise UserError(
+                f"setting command.{name} is {value:g}: expected {'at most 1' if name == 'zero' else 'more than 0 s'}"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -293,6 +336,7 @@ class Config(Section):
     nonfinite_limit: NonNegativeInt = 1000
     physics: PhysicsConfig = PhysicsConfig()
     env: EnvConfig = EnvConfig()
+    command: CommandConfig = CommandConfig()
     features: FeatureConfig = FeatureConfig()
     prior: PriorConfig = PriorConfig()
     amp: AMPConfig = AMPConfig()

@@ -14,6 +14,8 @@ _UNMEASURED = {
     "root_height": "the root's height",
     "root_linear_velocity": "the root's linear velocity",
     "key_points": "the places of key points",
+    "heading_linear_velocity": "the root's linear velocity",
+    "heading_key_points": "the places of key points",
 }
 _CARD = """# {run}
 
@@ -63,6 +65,11 @@ _MEANING = {
     "joint_rotation_6d": "x axis and z axis of each joint's rotation, in the order of the joints",
     "joint_velocity": "rad/s, in the order of the joints",
     "key_points": "of {points}: place less the root's, in the world's axes, m",
+    "heading_rotation_6d": "x axis and z axis of the root, in axes of which x points where it faces",
+    "heading_linear_velocity": "of the root, in those axes, m/s",
+    "heading_angular_velocity": "of the root, in those axes, rad/s",
+    "heading_key_points": "of {points}: place less the root's, in those axes, m",
+    "clip_phase": "share of the demonstration that is over, its sine and cosine once and twice per clip",
     "base_ang_vel": "of the root, in its own axes, rad/s",
     "projected_gravity": "where gravity points, a unit vector in the root's axes",
     "velocity_commands": "wanted velocity forward and to the left, m/s, and turn, rad/s",

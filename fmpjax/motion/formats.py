@@ -179,8 +179,8 @@ def locate(path: str | os.PathLike, robot: str = "unitree_g1") -> Path:
     """The file that ``path`` names: a bundled motion's, of the robot where it has one of that name, or its own."""
     file = Path(path)
     for name in (f"{robot}_{path}", str(path)):
-        if name in bundled():
-            return resources.folder("motions") / f"{name}.npz"
+        if (shipped := resources.folder("motions") / f"{name}.npz").is_file() and not file.is_absolute():
+            return shipped
     if file.is_file():
         return file
     what = f"no motion file {file}" if file.suffix else f"unknown motion {str(path)!r}"

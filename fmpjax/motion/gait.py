@@ -23,7 +23,7 @@ from fmpjax.motion.stride import Stride
 from fmpjax.motion.style import FASTEST, OPEN, Command, Style, effort, fitted
 from fmpjax.robots import CONTACT_DEPTH, Robot
 
-__all__ = ["LIBRARY", "Command", "Gait", "Style", "make", "measure", "synthesize", "zero_moment_point"]
+__all__ = ["LIBRARY", "Command", "Gait", "OutOfReach", "Style", "make", "measure", "synthesize", "zero_moment_point"]
 
 BENT = 0.19  # rad, least angle of a knee at the robot's own speed; a straight knee makes the joints race
 MARGIN = 0.04  # rad, least distance of a leg's joint to its limit

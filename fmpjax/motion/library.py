@@ -4,6 +4,7 @@ import dataclasses
 import math
 import os
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from fmpjax import resources
 from fmpjax.errors import UserError
 from fmpjax.motion.clip import MotionClip
 from fmpjax.motion.formats import load
+
+SUFFIXES = (".npz", ".npy", ".csv", ".txt", ".json", ".pkl", ".pt")  # of the files of a folder that are motions
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -95,6 +98,31 @@ def load_library(
         load(name, frames=span or None, rate=rate, robot=robot) for (name, _), span in zip(entries, spans, strict=True)
     )
     return MotionLibrary(clips, shares(entries))
+
+
+def listed(names: str) -> str:
+    """A list of motions in which each folder, one's own or a shipped one, is replaced by the motion files in it.
+
+    A folder's weight is shared evenly by its files.
+
+    Raises:
+      UserError: a folder holds no motion files, or `parse` refuses the list.
+    """
+    if os.path.isfile(names):
+        return names
+    entries = []
+    for name, weight in parse(names):
+        shipped = resources.folder("motions") / name
+        folder = next((path for path in (Path(name), shipped) if path.is_dir()), None)
+        if folder is None:
+            entries.append(name if weight == 1 else f"{name}:{weight:g}")
+            continue
+        files = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
+        if not files:
+            raise UserError(f"folder {folder} holds no motion files: expected some that end in {', '.join(SUFFIXES)}")
+        parts = [f"{name}/{path.stem}" if folder == shipped else str(path) for path in files]
+        entries += [f"{part}:{weight / len(files):.6g}" for part in parts]
+    return ",".join(entries)
 
 
 def describe(name: str) -> str:

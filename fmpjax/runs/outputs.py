@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fmpjax import deploy, diagnose, jsons, policy
+from fmpjax.commands import velocity
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Episodes, table
 from fmpjax.files import without_places, write
@@ -111,7 +112,17 @@ def _origin(run: Run) -> deploy.Origin:
         commit=run.provenance().get("commit"),
         evaluation=evaluation,
         changed=bool(run.provenance().get("uncommitted_changes")),
+        commands=_commands(run),
     )
+
+
+def _commands(run: Run) -> dict[str, tuple[float, float]] | None:
+    """Lowest and highest commanded velocities of a run that has them."""
+    if run.config.command.kind != "velocity":
+        return None
+    low, high = velocity.extent(run.config.command, run.trainer().env.library)
+    names = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+    return {name: (float(low[i]), float(high[i])) for i, name in enumerate(names)}
 
 
 def video(

@@ -17,6 +17,12 @@ def _joint_rotations(sim) -> np.ndarray:
     return rows if (cut := sim.policy.jointless_row) is None else np.insert(rows, cut, [1, 0, 0, 0, 0, 1], axis=0)
 
 
+def _heading(sim, vectors: np.ndarray) -> np.ndarray:
+    """World vectors ``[..., 3]`` in axes of which x points where the root faces."""
+    x, y = sim.axes[:2, 0] / max(np.linalg.norm(sim.axes[:2, 0]), 1e-6)
+    return vectors @ np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
+
+
 TERMS: dict[str, Callable[[Any], np.ndarray]] = {
     "root_height": lambda sim: sim.qpos[2:3],
     "root_rotation_6d": lambda sim: sim.axes[:, [0, 2]].T,
@@ -26,6 +32,10 @@ TERMS: dict[str, Callable[[Any], np.ndarray]] = {
     "joint_rotation_6d": _joint_rotations,
     "joint_velocity": lambda sim: sim.qvel[6:],
     "key_points": lambda sim: sim.key_points(),
+    "heading_rotation_6d": lambda sim: _heading(sim, sim.axes[:, [0, 2]].T),
+    "heading_linear_velocity": lambda sim: _heading(sim, sim.qvel[:3]),
+    "heading_angular_velocity": lambda sim: _heading(sim, sim.axes @ sim.qvel[3:6]),
+    "heading_key_points": lambda sim: _heading(sim, sim.key_points()),
     # What a robot senses, under the names of Unitree's programs.
     "base_ang_vel": lambda sim: sim.qvel[3:6],
     "projected_gravity": lambda sim: -sim.axes[2],

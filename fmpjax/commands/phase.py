@@ -1,0 +1,70 @@
+"""The time in the clip: the policy is told where it should be, and a step earns by being there."""
+
+import jax
+import jax.numpy as jnp
+
+from fmpjax.commands.base import Command
+from fmpjax.errors import UserError
+from fmpjax.frames import FrameLayout
+from fmpjax.motion import MotionLibrary
+from fmpjax.robots import Robot
+
+HARMONICS = (1, 2)  # of the clip's duration, whose sines and cosines the networks see beside the share that is over
+# Share and sharpness of each part of the reward: of the mean squared error of joints (rad²), joint velocities
+# (rad²/s²), root height (m²), and of the root's axes (of unit vectors). [D: chosen on ten seconds of a dance]
+JOINTS, JOINT_VELOCITIES, HEIGHT, TILT = (0.6, 10.0), (0.1, 0.2), (0.15, 40.0), (0.15, 5.0)
+
+
+def make(robot: Robot, library: MotionLibrary, frames: jax.Array, stride: int) -> Command:
+    """The row of the demonstration that the robot should be at.
+
+    An episode begins at its reset's row and ends with the clip, as a time-out. The default pose begins the clip.
+
+    Args:
+      robot: whose frames are read.
+      library: the only demonstration.
+      frames: ``[M + 1, F]`` compact frames of the table's rows.
+      stride: rows per control step.
+
+    Raises:
+      UserError: there are several demonstrations.
+    """
+    if len(library.clips) > 1:
+        raise UserError(
+            f"command.kind is 'phase' and the run has {len(library.clips)} motions: expected one, whose time is told"
+        )
+    last, layout = len(library.qpos) - 1, FrameLayout.of(robot)
+    table = jnp.asarray(frames)
+
+    def begin(rows, drawn):
+        return jnp.where(rows > last, 0, rows)
+
+    def advance(row, drawn):
+        following = row + stride
+        return jnp.minimum(following, last), following >= last
+
+    def observe(row):
+        share = row / last
+        angles = 2.0 * jnp.pi * share[..., None] * jnp.array(HARMONICS)
+        return jnp.concatenate([share[..., None], jnp.sin(angles), jnp.cos(angles)], axis=-1)
+
+    def reward(row, frame):
+        wanted = table[jnp.minimum(row + stride, last)]
+        # 2 - 2 cos of the angle between is its square, for the errors that matter.
+        product = frame * wanted
+        cosine = product[..., layout.cosine] + product[..., layout.sine]
+        off = frame - wanted
+        errors = (
+            (JOINTS, jnp.mean(2.0 - 2.0 * cosine, axis=-1)),
+            (JOINT_VELOCITIES, jnp.mean(off[..., layout.joint_velocity] ** 2, axis=-1)),
+            (HEIGHT, off[..., layout.root][..., 2] ** 2),
+            (TILT, jnp.sum(_heights(off[..., layout.rotation]) ** 2, axis=-1)),
+        )
+        return sum(share * jnp.exp(-sharpness * error) for (share, sharpness), error in errors)
+
+    return Command(1 + 2 * len(HARMONICS), lambda key, shape: (), begin, advance, observe, reward)
+
+
+def _heights(rotation: jax.Array) -> jax.Array:
+    """What of a 6D rotation ``[..., 6]`` does not change with the heading: the heights of its two axes."""
+    return rotation[..., 2::3]

@@ -1,0 +1,105 @@
+"""A commanded velocity in the heading frame: ahead, to the left, turning to the left."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fmpjax import rotations
+from fmpjax.commands.base import Command
+from fmpjax.config import CommandConfig
+from fmpjax.frames import FORWARD, FrameLayout
+from fmpjax.motion import MotionClip, MotionLibrary
+from fmpjax.robots import Robot
+
+AVERAGED = 1.0  # s, over which a demonstration's own velocity is its mean: about one stride
+
+
+class Velocity(NamedTuple):
+    """Commands of N environments."""
+
+    value: jax.Array  # [N, 3] m/s ahead, m/s to the left, rad/s to the left
+    left: jax.Array  # [N] int32, control steps for which it is still held
+
+
+def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrary) -> Command:
+    """Velocities between those of the demonstrations, or of the configured ranges; each is held for a random time.
+
+    Of the demonstrations' velocities, half of the commands are one of them, and half lie between two. An episode begins
+    with the velocity that its demonstration has there. The default pose stands.
+
+    Args:
+      config: of the command.
+      rate: control steps per second, Hz.
+      robot: whose frames are read.
+      library: the demonstrations, at the rate of their table's rows.
+    """
+    table = jnp.asarray(np.concatenate([*map(velocities, library.clips), np.zeros((1, 3))]), jnp.float32)
+    starts, lengths, weights = (jnp.asarray(x) for x in (library.starts, library.lengths, library.weights))
+
+    def own(key, shape):
+        clip_key, row_key = jax.random.split(key)
+        clip = jax.random.choice(clip_key, len(library.clips), shape, p=weights)
+        return table[starts[clip] + jax.random.randint(row_key, shape, 0, lengths[clip])]
+
+    shortest, longest = (max(1, round(seconds * rate)) for seconds in config.hold)
+    ranges = None if config.ranges is None else jnp.asarray(config.ranges, jnp.float32)
+    layout = FrameLayout.of(robot)
+
+    def draw(key, shape):
+        value_key, other_key, zero_key, hold_key = jax.random.split(key, 4)
+        if ranges is None:
+            between = jnp.maximum(jax.random.uniform(other_key, (*shape, 1), minval=-1.0), 0.0)
+            one, other = own(value_key, shape), own(jax.random.fold_in(other_key, 1), shape)
+            value = one + between * (other - one)
+        else:
+            value = jax.random.uniform(value_key, (*shape, 3), minval=ranges[:, 0], maxval=ranges[:, 1])
+        zero = jax.random.uniform(zero_key, shape) < config.zero
+        hold = jax.random.randint(hold_key, shape, shortest, longest + 1)
+        return Velocity(jnp.where(zero[..., None], 0.0, value), hold)
+
+    def begin(rows, drawn):
+        return Velocity(table[rows], drawn.left)
+
+    def advance(state, drawn):
+        never = jnp.zeros(state.left.shape, bool)
+        if drawn is None:
+            return state, never
+        over = state.left <= 1
+        value = jnp.where(over[..., None], drawn.value, state.value)
+        return Velocity(value, jnp.where(over, drawn.left, state.left - 1)), never
+
+    def reward(state, frame):
+        error = heading_velocity(frame, layout) - state.value
+        linear = jnp.exp(-(error[..., :2] ** 2).sum(-1) / config.speed_width**2)
+        turning = jnp.exp(-((error[..., 2] / config.turn_width) ** 2))
+        return (1.0 - config.turn_share) * linear + config.turn_share * turning
+
+    return Command(3, draw, begin, advance, lambda state: state.value, reward)
+
+
+def extent(config: CommandConfig, library: MotionLibrary) -> np.ndarray:
+    """Lowest and highest commanded velocity, ``[2, 3]`` (m/s, m/s, rad/s), zero included."""
+    own = np.concatenate([velocities(clip) for clip in library.clips])
+    spans = own if config.ranges is None else np.transpose(config.ranges)
+    return np.stack([np.minimum(spans.min(0), 0.0), np.maximum(spans.max(0), 0.0)])
+
+
+def heading_velocity(frame: jax.Array, layout: FrameLayout) -> jax.Array:
+    """Root velocity ``[..., 3]`` of frames ``[..., F]`` in the heading frame: m/s ahead, m/s and rad/s to the left."""
+    forward = frame[..., FORWARD]
+    x, y = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
+    vx, vy, _ = jnp.split(frame[..., layout.velocity], 3, axis=-1)
+    return jnp.concatenate([vx * x + vy * y, vy * x - vx * y, frame[..., layout.angular_velocity][..., 2:]], axis=-1)
+
+
+def velocities(clip: MotionClip) -> np.ndarray:
+    """A clip's velocity in its own heading, ``[T, 3]`` (m/s, m/s, rad/s): means over a second about each sample."""
+    yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
+    (vx, vy), cosine, sine = clip.qvel[:, :2].T, np.cos(yaw), np.sin(yaw)
+    own = np.stack([vx * cosine + vy * sine, vy * cosine - vx * sine, np.gradient(yaw) * clip.rate], axis=1)
+    width = min(len(own), max(1, round(AVERAGED * clip.rate)))
+    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(own, axis=0)])
+    first = np.clip(np.arange(len(own)) - width // 2, 0, len(own) - width)
+    return (sums[first + width] - sums[first]) / width
