@@ -213,8 +213,12 @@ class Evaluate:
     """First episodes at the smallest perturbation, by which a run is judged; docs/metrics.md."""
     last: bool = False
     """Take the newest checkpoint in place of the best."""
+    commands: bool = False
+    """Measure how well a policy that is told velocities obeys them; docs/steering.md."""
 
     def __call__(self) -> None:
+        if self.commands:
+            return self._commands()
         runs = _runs()
         from fmpjax.evaluate import Evaluator, table
 
@@ -228,6 +232,23 @@ class Evaluate:
         name = "evaluation-last" if self.last else "evaluation"
         run.save_evaluation(evaluation, name)
         print(f"wrote {run.folder / name}.json")
+
+    def _commands(self) -> None:
+        runs = _runs()
+        from fmpjax import steering
+        from fmpjax.files import write
+        from fmpjax.viz import heat
+
+        if self.episodes is not None and self.episodes < 1:
+            raise UserError(f"--episodes is {self.episodes}: expected at least 1")
+        run = runs.Run.open(self.run)
+        trainer, state = run.policy(best=not self.last)
+        print("compiling the episodes ...", flush=True)
+        found = steering.measure(trainer, state.ppo, **({} if self.episodes is None else {"changing": self.episodes}))
+        print(f"iteration {int(state.iteration):,}:\n{steering.table(found)}")
+        path = run.folder / ("steering-last.json" if self.last else "steering.json")
+        write(path, found.to_json())
+        print(f"wrote {path}\nwrote {heat.draw(path.with_suffix('.png'), *steering.maps(found))}")
 
 
 @dataclasses.dataclass(frozen=True)

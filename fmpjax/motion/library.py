@@ -114,13 +114,14 @@ def listed(names: str) -> str:
     for name, weight in parse(names):
         shipped = resources.folder("motions") / name
         folder = next((path for path in (Path(name), shipped) if path.is_dir()), None)
+        names_shipped = folder == shipped and not Path(name).is_absolute()
         if folder is None:
             entries.append(name if weight == 1 else f"{name}:{weight:g}")
             continue
         files = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
         if not files:
             raise UserError(f"folder {folder} holds no motion files: expected some that end in {', '.join(SUFFIXES)}")
-        parts = [f"{name}/{path.stem}" if folder == shipped else str(path) for path in files]
+        parts = [f"{name}/{path.stem}" if names_shipped else str(path) for path in files]
         entries += [f"{part}:{weight / len(files):.6g}" for part in parts]
     return ",".join(entries)
 

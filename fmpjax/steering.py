@@ -1,0 +1,215 @@
+"""How well a policy obeys commanded velocities: constant ones over a grid, and ones that change under way."""
+
+import dataclasses
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fmpjax import jsons, tables
+from fmpjax.commands import velocity
+from fmpjax.commands.velocity import Velocity
+from fmpjax.errors import UserError
+from fmpjax.frames import FrameLayout
+from fmpjax.ppo import PPOState
+from fmpjax.trainer import Trainer
+
+SPEEDS, TURNS = 7, 9  # cells of the grid ahead and turning
+CONSTANT = 10.0  # s, of an episode under one command
+SETTLING = 2.0  # s at its start that do not count
+LEG, LEGS = 3.0, 7  # s under each of an episode's changing commands, and their number
+FOLLOWING = 1.0  # s at the start of each that do not count
+ZERO = 0.1  # share of the changing commands that are zero
+
+
+class Cell(NamedTuple):
+    """Episodes under one constant command."""
+
+    ahead: float  # m/s
+    turn: float  # rad/s, to the left
+    episodes: int
+    falls: int
+    speed: float  # m/s ahead, mean of the episodes that stayed up
+    turned: float  # rad/s
+    speed_error: float  # m/s, mean of the absolute errors of the episodes' mean speeds
+    turn_error: float  # rad/s, the same of the turning
+    drift: float  # m/s to the left, mean of absolute values
+
+
+@dataclasses.dataclass(frozen=True)
+class Steering:
+    """The figures of a policy's obedience. Errors are absolute ones of means over an episode or a leg, averaged."""
+
+    cells: tuple[Cell, ...]
+    speed_error: float  # m/s, mean over the cells
+    turn_error: float  # rad/s
+    episodes: int  # under constant commands
+    falls: int
+    straight_turn: float  # rad/s, mean of the absolute turning where the command is straight ahead
+    standing_speed: float  # m/s, mean speed over the floor where the command is zero
+    changing_episodes: int
+    changing_falls: int
+    changing_speed_error: float  # m/s
+    changing_turn_error: float  # rad/s
+    seconds: float = CONSTANT  # of an episode under a constant command
+    changing_seconds: float = LEG * LEGS
+
+    def to_json(self) -> str:
+        """All figures; what is not defined is null."""
+        return jsons.dumps(vars(self) | {"cells": [cell._asdict() for cell in self.cells]})
+
+
+def measure(trainer: Trainer, state: PPOState, *, episodes: int = 4, changing: int = 256, seed: int = 1) -> Steering:
+    """Play the deterministic policy under commands and measure how it obeys.
+
+    Args:
+      trainer: of a run whose command is a velocity.
+      state: of the policy.
+      episodes: under each constant command, from different states of the nearest demonstration.
+      changing: episodes under commands that change.
+      seed: of starts and changing commands.
+
+    Raises:
+      UserError: the run's command is no velocity.
+    """
+    config, library = trainer.config.command, trainer.env.library
+    if config.kind != "velocity":
+        raise UserError(f"the run's command.kind is {config.kind!r}: expected 'velocity', whose grid is tried")
+    rng, rate = np.random.default_rng(seed), trainer.config.control_rate
+    low, high = velocity.extent(config, library)
+    speeds, turns = np.linspace(low[0], high[0], SPEEDS), np.linspace(low[2], high[2], TURNS)
+    if low[2] < 0 < high[2]:
+        turns[np.abs(turns).argmin()] = 0.0  # straight ahead is one of them
+    grid = np.array([(v, 0.0, w) for v in speeds for w in turns])
+    told = np.repeat(grid, episodes, axis=0)[None]
+    steps = round(CONSTANT * rate)
+    played = play(trainer, state, np.repeat(told, steps, axis=0), rng)
+    reached = np.where(played.fell[:, None], np.nan, played.velocity[round(SETTLING * rate) :].mean(0))
+    cells = _cells(grid, reached.reshape(len(grid), episodes, 3), played.fell.reshape(len(grid), episodes))
+    straight = [cell for cell in cells if cell.turn == 0 and cell.ahead > 0]
+    still = [i for i, (v, _, w) in enumerate(grid) if v == 0 and w == 0]
+    way = np.linalg.norm(played.place[-1] - played.place[round(SETTLING * rate)], axis=-1) / (CONSTANT - SETTLING)
+    way = np.where(played.fell, np.nan, way).reshape(len(grid), episodes)
+
+    legs = rng.uniform(low, high, (LEGS, changing, 3))
+    legs[rng.uniform(size=(LEGS, changing)) < ZERO] = 0.0
+    length = round(LEG * rate)
+    moved = play(trainer, state, np.repeat(legs, length, axis=0), rng)
+    means = moved.velocity.reshape(LEGS, length, changing, 3)[:, round(FOLLOWING * rate) :].mean(1)
+    off = np.abs(means - legs)[moved.alive.reshape(LEGS, length, changing)[:, -1]]
+    return Steering(
+        cells=tuple(cells),
+        speed_error=_mean([cell.speed_error for cell in cells]),
+        turn_error=_mean([cell.turn_error for cell in cells]),
+        episodes=told.shape[1],
+        falls=int(played.fell.sum()),
+        straight_turn=_mean([abs(cell.turned) for cell in straight]),
+        standing_speed=_mean(way[still].ravel()),
+        changing_episodes=changing,
+        changing_falls=int(moved.fell.sum()),
+        changing_speed_error=_mean(off[:, 0]),
+        changing_turn_error=_mean(off[:, 2]),
+    )
+
+
+class Played(NamedTuple):
+    """Episodes of N environments over T steps; after a fall nothing moves."""
+
+    velocity: np.ndarray  # [T, N, 3] in the heading frame: m/s, m/s, rad/s
+    place: np.ndarray  # [T, N, 2] m, of the root
+    alive: np.ndarray  # [T, N] bool
+    fell: np.ndarray  # [N] bool
+
+
+def play(trainer: Trainer, state: PPOState, told: np.ndarray, rng: np.random.Generator) -> Played:
+    """Episodes under the commands ``told [T, N, 3]``, from states whose demonstration moves most like the first."""
+    table = np.concatenate([velocity.velocities(clip) for clip in trainer.env.library.clips])
+    rows = []
+    for command in told[0]:
+        distance = np.abs(table - command).sum(-1)
+        rows.append(rng.choice(np.flatnonzero(distance <= distance.min() + 0.02)))
+    return Played(*map(np.asarray, _play(trainer, state, jnp.asarray(rows), jnp.asarray(told, jnp.float32))))
+
+
+@partial(jax.jit, static_argnums=0)
+def _play(trainer: Trainer, state: PPOState, rows: jax.Array, told: jax.Array):
+    env, layout = trainer.env, FrameLayout.of(trainer.robot)
+    policy, start = trainer.ppo.act(state, deterministic=True), env.start_at(rows)
+
+    def step(carry, command):
+        sim, observed, alive = carry
+        with trainer.precision():
+            action, _ = policy(env.seen(observed.actor, Velocity(command, jnp.zeros(len(rows), jnp.int32))), None)
+        reached = env.advance(sim, action)
+
+        def hold(new, old):
+            return jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        sim, observed = jax.tree.map(hold, (reached.physics, reached.observed), (sim, observed))
+        alive = alive & ~reached.fell
+        place = observed.frame[..., layout.root][..., :2]
+        return (sim, observed, alive), (velocity.heading_velocity(observed.frame, layout), place, alive)
+
+    carry = start.physics, start.observed, jnp.ones(len(rows), bool)
+    (_, _, alive), (velocities, places, lives) = jax.lax.scan(step, carry, told)
+    return velocities, places, lives, ~alive
+
+
+def _cells(grid: np.ndarray, reached: np.ndarray, fell: np.ndarray) -> list[Cell]:
+    """Figures of each command ``[C, 3]`` from mean velocities ``[C, E, 3]`` and falls ``[C, E]``."""
+    cells = []
+    for command, means, falls in zip(grid, reached, fell, strict=True):
+        off = np.abs(means - command)
+        cells.append(
+            Cell(
+                ahead=float(command[0]),
+                turn=float(command[2]),
+                episodes=len(falls),
+                falls=int(falls.sum()),
+                speed=_mean(means[:, 0]),
+                turned=_mean(means[:, 2]),
+                speed_error=_mean(off[:, 0]),
+                turn_error=_mean(off[:, 2]),
+                drift=_mean(off[:, 1]),
+            )
+        )
+    return cells
+
+
+def _mean(values: Any) -> float:
+    """Mean of what is not NaN; NaN where nothing is left."""
+    values = np.asarray(values, float)
+    return float(values[~np.isnan(values)].mean()) if (~np.isnan(values)).any() else float("nan")
+
+
+def table(steering: Steering) -> str:
+    """The figures as lines for people."""
+    s = steering
+    rows = [
+        ("mean error of the speed", f"{s.speed_error:.3f}", f"m/s, constant commands, {s.seconds:g} s each"),
+        ("mean error of the turning", f"{s.turn_error:.3f}", "rad/s"),
+        ("falls", f"{s.falls} of {s.episodes}", ""),
+        ("turning when told to go straight", f"{s.straight_turn:.3f}", "rad/s"),
+        ("speed when told to stand", f"{s.standing_speed:.3f}", "m/s over the floor"),
+        ("mean error of the speed", f"{s.changing_speed_error:.3f}", f"m/s, a new command every {LEG:g} s"),
+        ("mean error of the turning", f"{s.changing_turn_error:.3f}", "rad/s"),
+        ("falls", f"{s.changing_falls} of {s.changing_episodes}", f"in {s.changing_seconds:g} s"),
+    ]
+    return tables.lines("  {:<36} {:>20}  {}", rows)
+
+
+def maps(steering: Steering) -> tuple[list[float], list[float], dict[str, np.ndarray]]:
+    """Speeds of the rows, turning rates of the columns, and maps of errors and falls by title."""
+    speeds, turns = (sorted({getattr(cell, name) for cell in steering.cells}) for name in ("ahead", "turn"))
+    shape = len(speeds), len(turns)
+    titles = {
+        "speed_error": "mean error of the speed, m/s",
+        "turn_error": "mean error of the turning, rad/s",
+        "falls": f"falls of {steering.cells[0].episodes} episodes",
+    }
+    values = {
+        t: np.array([getattr(cell, n) for cell in steering.cells], float).reshape(shape) for n, t in titles.items()
+    }
+    return speeds, turns, values

@@ -1,0 +1,286 @@
+"""What a policy is told: what is drawn and held, what the networks see, what a step earns, what a run does with it."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_train import TINY, settings
+
+from fmpjax import cli, commands, config, features, motion, physics, rotations, runs, steering
+from fmpjax.commands import phase, velocity
+from fmpjax.config import CommandConfig, preset
+from fmpjax.env import Env
+from fmpjax.errors import UserError
+from fmpjax.frames import FrameLayout
+from fmpjax.motion import MotionClip, MotionLibrary, library
+from fmpjax.sim2sim.observation import TERMS
+from fmpjax.trainer import Trainer
+
+RATE = 50.0
+
+
+def course(robot, speed, turn, seconds=4.0, sideways=0.0):
+    """A clip whose root moves at a velocity in its own heading."""
+    steps = int(seconds * RATE)
+    yaw = turn * np.arange(steps) / RATE
+    step = np.stack([speed * np.cos(yaw) - sideways * np.sin(yaw), speed * np.sin(yaw) + sideways * np.cos(yaw)], 1)
+    qpos = np.tile(robot.default_qpos, (steps, 1))
+    qpos[:, :2] = np.cumsum(step, axis=0) / RATE
+    qpos[:, 3:7] = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=1)
+    return MotionClip.from_qpos("course", robot.name, RATE, qpos)
+
+
+@pytest.fixture(scope="module")
+def slow_and_left(robot):
+    """Two velocities: straight ahead at 0.4 m/s and to the left at 1.0 m/s and 0.5 rad/s."""
+    return MotionLibrary((course(robot, 0.4, 0.0), course(robot, 1.0, 0.5)), (0.5, 0.5))
+
+
+# --- velocities ------------------------------------------------------------------------------------------------------
+
+
+def test_a_clips_velocity_is_in_its_own_heading(robot):
+    found = velocity.velocities(course(robot, 0.7, -0.6, sideways=0.2))
+    assert found.shape == (200, 3)
+    np.testing.assert_allclose(found, np.tile([0.7, 0.2, -0.6], (200, 1)), atol=0.01)
+
+
+def test_a_frames_velocity_is_in_the_heading_frame(robot, slow_and_left):
+    clip = slow_and_left.clips[1]
+    frame = features.observe(robot, jnp.asarray(clip.qpos[100]), jnp.asarray(clip.qvel[100]), "compact").frame
+    np.testing.assert_allclose(velocity.heading_velocity(frame, FrameLayout.of(robot)), [1.0, 0.0, 0.5], atol=0.01)
+
+
+def test_commands_are_demonstrations_velocities_or_between_two(robot, slow_and_left):
+    settings = CommandConfig(kind="velocity", hold=(0.5, 1.0), zero=0.2)
+    command = velocity.make(settings, RATE, robot, slow_and_left)
+    value, left = (np.asarray(x) for x in command.draw(jax.random.PRNGKey(0), (20_000,)))
+    zero = (value == 0).all(1)
+    assert zero.mean() == pytest.approx(0.2, abs=0.01)
+    assert left.min() == 25 and left.max() == 50
+    # On the line between the two: one of them for half of the commands, and for half of the pairs of the other half.
+    part = (value[~zero, 0] - 0.4) / 0.6
+    np.testing.assert_allclose(value[~zero, 2], 0.5 * part, atol=0.01)
+    ends = (np.abs(part) < 0.01) | (np.abs(part - 1) < 0.01)
+    assert ends.mean() == pytest.approx(0.75, abs=0.02) and part.min() > -0.01 and part.max() < 1.01
+
+
+def test_commands_from_ranges(robot, slow_and_left):
+    settings = CommandConfig(kind="velocity", ahead=(-0.5, 1.5), turn=(0.1, 0.3), zero=0.0)
+    value = np.asarray(velocity.make(settings, RATE, robot, slow_and_left).draw(jax.random.PRNGKey(0), (5000,)).value)
+    np.testing.assert_allclose([value.min(0), value.max(0)], [[-0.5, 0, 0.1], [1.5, 0, 0.3]], atol=0.01)
+    np.testing.assert_allclose(velocity.extent(settings, slow_and_left), [[-0.5, 0, 0], [1.5, 0, 0.3]])
+
+
+def test_a_command_is_held_and_then_another(robot, slow_and_left):
+    command = velocity.make(CommandConfig(kind="velocity"), RATE, robot, slow_and_left)
+    rows = jnp.array([50, 250, 400])  # of the first clip, of the second, and the default pose
+    drawn = velocity.Velocity(jnp.full((3, 3), 9.0), jnp.array([3, 1, 2]))
+    state = command.begin(rows, drawn)
+    np.testing.assert_allclose(state.value, [[0.4, 0, 0], [1.0, 0, 0.5], [0, 0, 0]], atol=0.01)
+    np.testing.assert_array_equal(command.observe(state), state.value)
+    after, over = command.advance(state, drawn)
+    np.testing.assert_array_equal((np.asarray(after.value) == 9).all(1), [False, True, False])
+    np.testing.assert_array_equal(after.left, [2, 1, 1])
+    assert not over.any() and command.advance(state, None)[0] is state
+
+
+def test_the_reward_of_a_velocity_in_closed_form(robot, slow_and_left):
+    settings = CommandConfig(kind="velocity", speed_width=0.5, turn_width=0.4, turn_share=0.3)
+    command, layout = velocity.make(settings, RATE, robot, slow_and_left), FrameLayout.of(robot)
+    frame = np.zeros((1, layout.size), np.float32)
+    frame[:, layout.rotation] = [0, 1, 0, 0, 0, 1]  # faces +y
+    frame[:, layout.velocity], frame[:, layout.angular_velocity] = [-0.3, 1.0, 5.0], [7.0, 7.0, 0.2]
+    state = velocity.Velocity(jnp.array([[0.8, 0.3, 0.0]]), jnp.array([1]))
+    expected = 0.7 * np.exp(-(0.2**2) / 0.25) + 0.3 * np.exp(-0.25)
+    np.testing.assert_allclose(command.reward(state, jnp.asarray(frame)), [expected], rtol=1e-5)
+
+
+# --- phases ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def phased(robot, walk):
+    changes = {"command.kind": "phase", "env.axes": "heading", "features.axes": "heading", "env.first_cap": 1000}
+    settings = preset("smoke", **changes)
+    return Env(robot, walk, settings, physics.make(robot, settings.physics))
+
+
+def test_the_phase_goes_on_and_ends_the_episode_with_the_clip(phased, walk):
+    last = len(walk) - 1
+    state = phased.command.begin(jnp.array([0, last - 2, last + 1]), ())
+    np.testing.assert_array_equal(state, [0, last - 2, 0])
+    seen = phased.command.observe(jnp.array([0, last // 4, last]))
+    np.testing.assert_allclose(seen[0], [0, 0, 0, 1, 1], atol=1e-6)
+    assert phased.command.size == seen.shape[1] == 5 and float(seen[1, 1]) == pytest.approx(1, abs=1e-3)
+    state, over = phased.command.advance(state, None)
+    assert state.tolist() == [1, last - 1, 1] and not over.any()
+    assert phased.command.advance(state, None)[1].tolist() == [False, True, False]
+
+
+def test_a_phase_earns_all_for_the_demonstration_and_less_for_what_is_off(phased):
+    rows, table = jnp.array([20, 40]), jnp.asarray(phased._table.frame)
+    np.testing.assert_allclose(phased.command.reward(rows, table[rows + 1]), 1.0, atol=1e-5)
+    late = phased.command.reward(rows, table[rows - 10])
+    assert (np.asarray(late) < 0.9).all() and (np.asarray(late) > 0.1).all()
+    # A turned world earns the same; joints that are off by 0.1 rad earn 0.6 (1 - exp(-0.1)) less.
+    layout = FrameLayout.of(phased.robot)
+    angle = 0.1
+    cosine, sine = table[rows + 1][:, layout.cosine], table[rows + 1][:, layout.sine]
+    off = table[rows + 1].at[:, layout.cosine].set(cosine * np.cos(angle) - sine * np.sin(angle))
+    off = off.at[:, layout.sine].set(sine * np.cos(angle) + cosine * np.sin(angle))
+    np.testing.assert_allclose(phased.command.reward(rows, off), 1 - 0.6 * (1 - np.exp(-0.1)), atol=1e-3)
+
+
+def test_a_phase_is_of_one_motion(robot):
+    two = motion.load_library("walk,turn_left")
+    settings = preset("smoke", **{"command.kind": "phase"})
+    with pytest.raises(UserError, match="command.kind is 'phase' and the run has 2 motions: expected one"):
+        Env(robot, two, settings, physics.make(robot, settings.physics))
+
+
+# --- observations ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("content", ["full", "compact"])
+def test_a_heading_observation_does_not_know_north(robot, walk, content):
+    """Turn the world by any angle: what is observed stays."""
+    qpos, qvel = walk.qpos[30:33].copy(), walk.qvel[30:33].copy()
+    turned, moved = qpos.copy(), qvel.copy()
+    for i, angle in enumerate((0.7, -2.5, 3.1)):
+        by = np.array([np.cos(angle / 2), 0, 0, np.sin(angle / 2)])
+        turned[i, :3], moved[i, :3] = rotations.rotate(by, qpos[i, :3]), rotations.rotate(by, qvel[i, :3])
+        turned[i, 3:7] = rotations.multiply(by, qpos[i, 3:7])
+    observed = [
+        features.observe(robot, jnp.float32(q), jnp.float32(v), f"{content} heading").actor
+        for q, v in ((qpos, qvel), (turned, moved))
+    ]
+    np.testing.assert_allclose(*observed, atol=2e-5)
+    world = features.observe(robot, jnp.float32(turned), jnp.float32(moved), content).actor
+    assert np.abs(world - observed[0]).max() > 0.1
+    # Facing +x the two are one.
+    qpos[:, 3:7] = [1, 0, 0, 0]
+    both = [
+        features.observe(robot, jnp.float32(qpos), jnp.float32(qvel), form).actor
+        for form in (content, f"{content} heading")
+    ]
+    np.testing.assert_allclose(*both, atol=1e-6)
+
+
+def test_the_parts_of_an_observation_have_names_and_widths(robot):
+    settings = preset("laptop", **config.COMMANDS["velocity"])
+    form = features.observation_form(settings)
+    assert form == "compact heading velocity" and features.observation_form(preset("laptop")) == "compact"
+    terms = features.observation_terms(robot, form)
+    assert list(terms)[-1] == "velocity_commands" and "heading_key_points" in terms and "key_points" not in terms
+    assert sum(terms.values()) == 89 and set(terms) <= set(TERMS)
+
+
+# --- runs ------------------------------------------------------------------------------------------------------------
+
+
+def test_no_command_changes_nothing(robot, walk):
+    """No leaf of the state, no number of the observation, no key."""
+    settings = preset("smoke", **TINY)
+    env = Env(robot, walk, settings, physics.make(robot, settings.physics))
+    state = env.reset(jax.random.PRNGKey(0))
+    assert env.command is None and state.command == () and env.observation_size == 86
+    assert commands.make(settings, robot, env.library, env._table.frame) is None
+
+
+def test_product_and_sum():
+    prior, obeyed = jnp.array([1.0, 0.5]), jnp.array([0.5, 1.0])
+    np.testing.assert_array_equal(commands.combine(CommandConfig(), prior, obeyed), [0.5, 0.5])
+    joined = commands.combine(CommandConfig(combine="sum", weight=2.0), prior, obeyed)
+    np.testing.assert_array_equal(joined, [2.0, 2.5])
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"command.ahead": (1.0, 0.5)}, "setting command.ahead is 1, 0.5: expected two numbers, the lower one first"),
+        ({"command.turn": (0.5,)}, "setting command.turn is 0.5: expected two numbers"),
+        ({"command.hold": (0.0, 1.0)}, "setting command.hold begins with 0: expected more than 0 s"),
+        ({"command.zero": 1.5}, "command.zero is 1.5"),
+        ({"command.kind": "speed"}, "'speed'"),
+    ],
+)
+def test_bad_commands_are_refused_in_a_sentence(changes, sentence):
+    with pytest.raises(UserError, match=sentence):
+        preset("smoke", **changes)
+
+
+def test_a_folder_is_a_list_of_its_motions(tmp_path):
+    for name in ("b", "a"):
+        motion.save(motion.load("walk"), tmp_path / f"{name}.npz")
+    assert library.listed(f"{tmp_path}:3,walk") == f"{tmp_path}/a.npz:1.5,{tmp_path}/b.npz:1.5,walk"
+    gaits = library.listed("gaits").split(",")
+    assert len(gaits) > 20 and all(name.startswith("gaits/") for name in gaits)
+    (tmp_path / "none").mkdir()
+    with pytest.raises(UserError, match="none holds no motion files: expected some that end in .npz"):
+        library.listed(str(tmp_path / "none"))
+
+
+def test_the_shipped_gaits_move_as_their_names_say():
+    found = motion.load_library(library.listed("gaits"))
+    for clip in found.clips:
+        ahead, turn = map(float, clip.name.rsplit("/")[-1].split("_"))
+        np.testing.assert_allclose(velocity.velocities(clip).mean(0), [ahead, 0.0, turn], atol=0.03)
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """A tiny run that is told velocities, from the command line."""
+    folder = tmp_path_factory.mktemp("told") / "run"
+    changes = TINY | {"transitions": 128, "evaluations": (1.0,)}
+    command = [
+        "train",
+        "--preset",
+        "smoke",
+        "--command",
+        "velocity",
+        "--motion",
+        "walk,turn_left",
+        "--run",
+        str(folder),
+    ]
+    cli.main([*command, *settings(changes)])
+    return folder
+
+
+@pytest.mark.slow
+def test_a_run_is_told_velocities_and_measured(told, capsys):
+    trainer, state = runs.Run.open(told).policy()
+    assert trainer.env.observation_size == 89 and state.env.command.value.shape == (8, 3)
+    rows = (told / "metrics.csv").read_text().splitlines()
+    assert "command/reward" in rows[0]
+    cli.main(["evaluate", str(told), "--commands", "--episodes", "4"])
+    assert "turning when told to go straight" in capsys.readouterr().out
+    found = json.loads((told / "steering.json").read_text())
+    assert found["changing_episodes"] == 4 and len(found["cells"]) == steering.SPEEDS * steering.TURNS
+    assert (told / "steering.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_a_run_without_commands_has_no_grid(robot, walk):
+    trainer = Trainer(preset("smoke", **TINY), walk)
+    with pytest.raises(UserError, match="the run's command.kind is 'none': expected 'velocity'"):
+        steering.measure(trainer, None)
+
+
+def test_phase_constants_make_one():
+    parts = (phase.JOINTS, phase.JOINT_VELOCITIES, phase.HEIGHT, phase.TILT)
+    assert sum(share for share, _ in parts) == pytest.approx(1.0)
+
+
+def test_figures_of_cells():
+    grid = np.array([[0.5, 0.0, 0.2]])
+    reached = np.array([[[0.6, 0.1, 0.1], [0.3, -0.1, 0.5], [np.nan] * 3]])
+    (cell,) = steering._cells(grid, reached, np.array([[False, False, True]]))
+    assert (cell.episodes, cell.falls) == (3, 1)
+    np.testing.assert_allclose([cell.speed, cell.turned], [0.45, 0.3])
+    np.testing.assert_allclose([cell.speed_error, cell.turn_error, cell.drift], [0.15, 0.2, 0.1])
+    assert dataclasses.is_dataclass(steering.Steering)
