@@ -635,5 +635,5 @@ def page() -> str:
         figure = rule.figure + (f", where {rule.when}" if rule.when else "")
         figure += f" (`{'`, `'.join(rule.methods)}`)" if rule.methods else ""
         look = ", ".join(f"`{key}`" for key in rule.look)
-        lines.append(tables.row((rule.name, figure, rule.healthy, look, rule.evidence)))
+        lines.append(tables.row((rule.name, figure, str(rule.healthy), look, rule.evidence)))
     return "\n".join(lines)
