@@ -3,6 +3,7 @@
 import functools
 import io
 import pickle
+import zipfile
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from fmpjax import metrics, robots, rotations, transport
 from fmpjax.errors import UserError
 from fmpjax.motion import clip as clips
 from fmpjax.motion import readers
+from fmpjax.motion.readers import archive
 from fmpjax.motion.readers.recording import Options
 
 # The same examples in every run; a slow machine is no failure.
@@ -225,3 +227,33 @@ def test_flipped_bytes_are_read_or_refused_in_a_sentence(path, kind, data):
        st.binary(max_size=200))  # fmt: skip
 def test_random_bytes_are_refused_in_a_sentence(path, head, raw):
     assert read(path, head + raw) is None
+
+
+def _member(header, compression=zipfile.ZIP_STORED):
+    """An archive with one array of that header."""
+    out, text = io.BytesIO(), header.encode() + b"\n"
+    with zipfile.ZipFile(out, "w", compression) as archive:
+        archive.writestr("rate.npy", b"")
+        archive.writestr("qpos.npy", b"\x93NUMPY\x01\0" + len(text).to_bytes(2, "little") + text + bytes(24))
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("header", ["{'shape': (3,", "'''", "-" * 9000 + "1", "(" * 5000])
+def test_headers_that_python_cannot_parse_are_refused(path, header):
+    path.write_bytes(_member(header))
+    with pytest.raises(UserError, match="not a readable .npz archive"):
+        archive.Arrays(path)["qpos"]
+
+
+def test_a_member_that_claims_another_compression_is_refused(path):
+    """The byte that LZMA takes for its options is tried at every value."""
+    raw = bytearray(_member("{'descr': '<f8', 'fortran_order': False, 'shape': (3,), }", zipfile.ZIP_DEFLATED))
+    local, central = raw.rindex(b"PK\x03\x04"), raw.rindex(b"PK\x01\x02")
+    raw[local + 8] = raw[central + 10] = zipfile.ZIP_LZMA
+    start = local + 30 + len("qpos.npy")
+    raw[start + 2 : start + 4] = b"\x05\0"  # size of the options
+    for byte in range(256):
+        raw[start + 4] = byte
+        path.write_bytes(raw)
+        with pytest.raises(UserError, match="not a readable .npz archive"):
+            archive.Arrays(path)["qpos"]

@@ -5,6 +5,7 @@ member's size with its header and with `MOST_BYTES` before it reads. An array of
 """
 
 import io
+import lzma
 import math
 import zipfile
 import zlib
@@ -52,7 +53,10 @@ class Arrays(Mapping):
                 (1, 0): np.lib.format.read_array_header_1_0,
                 (2, 0): np.lib.format.read_array_header_2_0,
             }[version]
-            shape, fortran, dtype = header(data)
+            try:
+                shape, fortran, dtype = header(data)
+            except Exception:  # NumPy parses it as a program's text, which has no common error
+                raise self._unreadable() from None
             if dtype.kind == "O" and size <= pickled.MOST_BYTES:
                 return pickled.read_texts(self._file, data.read())
             if dtype.kind not in "fiuU":
@@ -67,7 +71,7 @@ class Arrays(Mapping):
             raise UserError(f"{self._file}: array {name!r} holds objects, expected numbers or text") from None
         except (OSError, EOFError, ValueError, TypeError, KeyError, NotImplementedError, RuntimeError, SyntaxError):
             raise self._unreadable() from None
-        except (zipfile.BadZipFile, zlib.error):
+        except (zipfile.BadZipFile, zlib.error, lzma.LZMAError):
             # zipfile has no common error for a member that is cut short, damaged or encrypted.
             raise self._unreadable() from None
 

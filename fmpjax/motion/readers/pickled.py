@@ -272,16 +272,12 @@ class _Scalar(_Array):
 class _Following(_Array):
     """``joblib.numpy_pickle.NumpyArrayWrapper``: an array whose bytes follow in the file."""
 
-    state: dict | None = None
-
     def __setstate__(self, state) -> None:
         self.state = state
 
     def fill(self, following) -> None:
         """Take the array's bytes from ``following(size)``."""
         state, self.state = self.state, None
-        if not isinstance(state, dict):
-            raise _Refused("the pickle has an array of unknown shape")
         shape, dtype = state["shape"], state["dtype"]
         if not isinstance(dtype, _Dtype) or dtype.dtype.kind not in "fiub":
             raise _Refused("the pickle has an array of something that is not a number")
