@@ -94,7 +94,7 @@ class Steps(NamedTuple):
     length: jax.Array  # [T, N] int32, steps of the episode up to and including this one
     frame: jax.Array  # [T, N, F] compact frame after the step, before any reset
     window: jax.Array  # [T, N, H] int32 indices into the frame table
-    command: Any = ()  # in force during the step
+    obeyed: Any = ()  # [T, N] in [0, 1], what obeying the command earned; nothing without commands
 
 
 class ActionMap(NamedTuple):
@@ -290,9 +290,9 @@ class Env:
         reached = self.advance(now.physics, action)
         age = now.age + 1
         timed_out = (age >= cap) & ~reached.fell
-        command = ()
+        command, obeyed = (), ()
         if self.command:
-            command, over = self.command.advance(now.command, drawn.command)
+            command, over, obeyed = self.command.advance(now.command, drawn.command, reached.observed.frame)
             timed_out |= over & ~reached.fell
         window = sharding.split(jnp.concatenate([now.window[:, 1:], drawn.row[:, None]], axis=1))
         record = Steps(
@@ -306,7 +306,7 @@ class Env:
             length=age,
             frame=reached.observed.frame,
             window=window,
-            command=now.command,
+            obeyed=obeyed,
         )
         done = reached.fell | timed_out
         sim, observed = self._begin(drawn.start, drawn.key)

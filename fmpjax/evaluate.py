@@ -185,7 +185,7 @@ class Evaluator:
             fell, length = fell | (alive & reached.fell), length + alive
             still_alive = alive & ~reached.fell
             if env.command:  # it stays what it was at the start, and may end the episode
-                command, over = env.command.advance(command, None)
+                command, over, _ = env.command.advance(command, None, reached.observed.frame)
                 still_alive &= ~over
 
             def hold(new, old):

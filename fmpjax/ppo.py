@@ -153,6 +153,7 @@ class PPO:
 
     def update(self, state: PPOState, batch: Batch, key: jax.Array) -> tuple[PPOState, dict[str, jax.Array]]:
         """One PPO update from a rollout."""
+        # long: the two losses close over the rollout and its targets
         config = self.config
         before = None if batch.age is None else batch.age - 1
         value = self.value(state, batch.observation, before)

@@ -10,7 +10,6 @@ import numpy as np
 
 from fmpjax import jsons, tables
 from fmpjax.commands import velocity
-from fmpjax.commands.velocity import Velocity
 from fmpjax.errors import UserError
 from fmpjax.frames import FrameLayout
 from fmpjax.ppo import PPOState
@@ -141,7 +140,7 @@ def _play(trainer: Trainer, state: PPOState, rows: jax.Array, told: jax.Array):
     def step(carry, command):
         sim, observed, alive = carry
         with trainer.precision():
-            action, _ = policy(env.seen(observed.actor, Velocity(command, jnp.zeros(len(rows), jnp.int32))), None)
+            action, _ = policy.act(env.seen(observed.actor, start.command._replace(value=command)), None)
         reached = env.advance(sim, action)
 
         def hold(new, old):

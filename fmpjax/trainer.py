@@ -128,9 +128,8 @@ class Trainer:
         """The prior's reward ``[T, N]`` joined by what the steps earn by obeying, where they are told anything."""
         if not self.env.command:
             return reward, {}
-        obeyed = self.env.command.reward(steps.command, steps.frame)
-        measured = {"command/reward": obeyed.mean(), "command/prior_reward": reward.mean()}
-        return commands.combine(self.config.command, reward, obeyed), measured
+        measured = {"command/reward": steps.obeyed.mean(), "command/prior_reward": reward.mean()}
+        return commands.combine(self.config.command, reward, steps.obeyed), measured
 
     def compile(self, state: TrainState) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
         """The compiled program of a run: ``config.chunk`` iterations, metrics averaged over them.

@@ -57,7 +57,7 @@ def test_a_frames_velocity_is_in_the_heading_frame(robot, slow_and_left):
 def test_commands_are_demonstrations_velocities_or_between_two(robot, slow_and_left):
     settings = CommandConfig(kind="velocity", hold=(0.5, 1.0), zero=0.2)
     command = velocity.make(settings, RATE, robot, slow_and_left)
-    value, left = (np.asarray(x) for x in command.draw(jax.random.PRNGKey(0), (20_000,)))
+    value, left, _ = (np.asarray(x) for x in command.draw(jax.random.PRNGKey(0), (20_000,)))
     zero = (value == 0).all(1)
     assert zero.mean() == pytest.approx(0.2, abs=0.01)
     assert left.min() == 25 and left.max() == 50
@@ -78,25 +78,31 @@ def test_commands_from_ranges(robot, slow_and_left):
 def test_a_command_is_held_and_then_another(robot, slow_and_left):
     command = velocity.make(CommandConfig(kind="velocity"), RATE, robot, slow_and_left)
     rows = jnp.array([50, 250, 400])  # of the first clip, of the second, and the default pose
-    drawn = velocity.Velocity(jnp.full((3, 3), 9.0), jnp.array([3, 1, 2]))
+    drawn = velocity.Velocity(jnp.full((3, 3), 9.0), jnp.array([3, 1, 2]), jnp.zeros((3, 3)))
+    frame = jnp.zeros((3, FrameLayout.of(robot).size))
     state = command.begin(rows, drawn)
     np.testing.assert_allclose(state.value, [[0.4, 0, 0], [1.0, 0, 0.5], [0, 0, 0]], atol=0.01)
     np.testing.assert_array_equal(command.observe(state), state.value)
-    after, over = command.advance(state, drawn)
+    after, over, _ = command.advance(state, drawn, frame)
     np.testing.assert_array_equal((np.asarray(after.value) == 9).all(1), [False, True, False])
     np.testing.assert_array_equal(after.left, [2, 1, 1])
-    assert not over.any() and command.advance(state, None)[0] is state
+    assert not over.any()
+    np.testing.assert_array_equal(command.advance(state, None, frame).state.value, state.value)
 
 
 def test_the_reward_of_a_velocity_in_closed_form(robot, slow_and_left):
-    settings = CommandConfig(kind="velocity", speed_width=0.5, turn_width=0.4, turn_share=0.3)
+    settings = CommandConfig(kind="velocity", speed_width=0.5, turn_width=0.4, turn_share=0.3, average=0.1)
     command, layout = velocity.make(settings, RATE, robot, slow_and_left), FrameLayout.of(robot)
     frame = np.zeros((1, layout.size), np.float32)
     frame[:, layout.rotation] = [0, 1, 0, 0, 0, 1]  # faces +y
     frame[:, layout.velocity], frame[:, layout.angular_velocity] = [-0.3, 1.0, 5.0], [7.0, 7.0, 0.2]
-    state = velocity.Velocity(jnp.array([[0.8, 0.3, 0.0]]), jnp.array([1]))
-    expected = 0.7 * np.exp(-(0.2**2) / 0.25) + 0.3 * np.exp(-0.25)
-    np.testing.assert_allclose(command.reward(state, jnp.asarray(frame)), [expected], rtol=1e-5)
+    state = velocity.Velocity(jnp.array([[0.8, 0.3, 0.0]]), jnp.array([1]), jnp.zeros((1, 3)))
+    # Errors of 0.2 m/s and 0.2 rad/s, of which the first of five steps counts a fifth and all that follow the rest.
+    for share in (0.2, 0.36):
+        state, _, reward = command.advance(state, None, jnp.asarray(frame))
+        expected = 0.7 * np.exp(-((0.2 * share) ** 2) / 0.25) + 0.3 * np.exp(-((0.2 * share) ** 2) / 0.16)
+        np.testing.assert_allclose(reward, [expected], rtol=1e-5)
+    np.testing.assert_allclose(state.off, [[0.072, 0.0, 0.072]], atol=1e-6)
 
 
 # --- phases ----------------------------------------------------------------------------------------------------------
@@ -116,15 +122,16 @@ def test_the_phase_goes_on_and_ends_the_episode_with_the_clip(phased, walk):
     seen = phased.command.observe(jnp.array([0, last // 4, last]))
     np.testing.assert_allclose(seen[0], [0, 0, 0, 1, 1], atol=1e-6)
     assert phased.command.size == seen.shape[1] == 5 and float(seen[1, 1]) == pytest.approx(1, abs=1e-3)
-    state, over = phased.command.advance(state, None)
+    frame = jnp.zeros((3, FrameLayout.of(phased.robot).size))
+    state, over, _ = phased.command.advance(state, None, frame)
     assert state.tolist() == [1, last - 1, 1] and not over.any()
-    assert phased.command.advance(state, None)[1].tolist() == [False, True, False]
+    assert phased.command.advance(state, None, frame).over.tolist() == [False, True, False]
 
 
 def test_a_phase_earns_all_for_the_demonstration_and_less_for_what_is_off(phased):
     rows, table = jnp.array([20, 40]), jnp.asarray(phased._table.frame)
-    np.testing.assert_allclose(phased.command.reward(rows, table[rows + 1]), 1.0, atol=1e-5)
-    late = phased.command.reward(rows, table[rows - 10])
+    np.testing.assert_allclose(phased.command.advance(rows, None, table[rows + 1]).reward, 1.0, atol=1e-5)
+    late = phased.command.advance(rows, None, table[rows - 10]).reward
     assert (np.asarray(late) < 0.9).all() and (np.asarray(late) > 0.1).all()
     # A turned world earns the same; joints that are off by 0.1 rad earn 0.6 (1 - exp(-0.1)) less.
     layout = FrameLayout.of(phased.robot)
@@ -132,7 +139,7 @@ def test_a_phase_earns_all_for_the_demonstration_and_less_for_what_is_off(phased
     cosine, sine = table[rows + 1][:, layout.cosine], table[rows + 1][:, layout.sine]
     off = table[rows + 1].at[:, layout.cosine].set(cosine * np.cos(angle) - sine * np.sin(angle))
     off = off.at[:, layout.sine].set(sine * np.cos(angle) + cosine * np.sin(angle))
-    np.testing.assert_allclose(phased.command.reward(rows, off), 1 - 0.6 * (1 - np.exp(-0.1)), atol=1e-3)
+    np.testing.assert_allclose(phased.command.advance(rows, None, off).reward, 1 - 0.6 * (1 - np.exp(-0.1)), atol=1e-3)
 
 
 def test_a_phase_is_of_one_motion(robot):

@@ -15,8 +15,15 @@ class Command(NamedTuple):
     size: int  # numbers that the networks see
     draw: Callable[[jax.Array, tuple[int, ...]], Any]  # (key, (N,)) -> drawn: random numbers of one step
     begin: Callable[[jax.Array, Any], Any]  # (rows [N], drawn) -> state, of episodes that begin at these table rows
-    # (state, drawn) -> state, over [N] bool: after a control step, and whether the command ends the episode. Without
-    # random numbers, where drawn is None, a command that is held is held on.
-    advance: Callable[[Any, Any], tuple[Any, jax.Array]]
+    # (state, drawn, frame [N, F] reached) -> Told: after a control step. Without random numbers, where drawn is None, a
+    # command that is held is held on.
+    advance: Callable[[Any, Any, jax.Array], "Told"]
     observe: Callable[[Any], jax.Array]  # state -> [N, size]
-    reward: Callable[[Any, jax.Array], jax.Array]  # (state in force, frame [N, F] reached) -> [N], in [0, 1]
+
+
+class Told(NamedTuple):
+    """What a control step makes of commands."""
+
+    state: Any  # in force from here on
+    over: jax.Array  # [N] bool, whether the command ends the episode, as a time-out
+    reward: jax.Array  # [N] in [0, 1], what the step earned

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from fmpjax.commands.base import Command
+from fmpjax.commands.base import Command, Told
 from fmpjax.errors import UserError
 from fmpjax.frames import FrameLayout
 from fmpjax.motion import MotionLibrary
@@ -39,9 +39,9 @@ def make(robot: Robot, library: MotionLibrary, frames: jax.Array, stride: int) -
     def begin(rows, drawn):
         return jnp.where(rows > last, 0, rows)
 
-    def advance(row, drawn):
+    def advance(row, drawn, frame):
         following = row + stride
-        return jnp.minimum(following, last), following >= last
+        return Told(jnp.minimum(following, last), following >= last, reward(row, frame))
 
     def observe(row):
         share = row / last
@@ -62,7 +62,7 @@ def make(robot: Robot, library: MotionLibrary, frames: jax.Array, stride: int) -
         )
         return sum(share * jnp.exp(-sharpness * error) for (share, sharpness), error in errors)
 
-    return Command(1 + 2 * len(HARMONICS), lambda key, shape: (), begin, advance, observe, reward)
+    return Command(1 + 2 * len(HARMONICS), lambda key, shape: (), begin, advance, observe)
 
 
 def _heights(rotation: jax.Array) -> jax.Array:

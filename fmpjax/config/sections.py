@@ -99,9 +99,10 @@ class CommandConfig(Section):
     ahead: tuple[float, ...] = ()
     sideways: tuple[float, ...] = ()  # m/s, the same to the left; empty for none where another range is given [D]
     turn: tuple[float, ...] = ()  # rad/s, the same of turning to the left [D]
-    speed_width: PositiveFloat = 0.5  # m/s, error at which the reward of the speed falls to 1/e [D]
-    turn_width: PositiveFloat = 0.5  # rad/s, error at which the reward of the turning falls to 1/e [D]
-    turn_share: Fraction = 0.25  # of the turning in the reward [D]
+    average: PositiveFloat = 0.5  # s, time constant of the running mean of the errors [D: half a stride]
+    speed_width: PositiveFloat = 0.35  # m/s, error at which the reward of the speed falls to 1/e [D]
+    turn_width: PositiveFloat = 0.35  # rad/s, error at which the reward of the turning falls to 1/e [D]
+    turn_share: Fraction = 0.5  # of the turning in the reward [D]
 
     @property
     def ranges(self) -> tuple[tuple[float, ...], ...] | None:

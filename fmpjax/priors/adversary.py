@@ -133,6 +133,7 @@ class Adversary(NamedTuple):
 
 def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
     """The network that minimizes ``loss`` between the windows of the demonstration and the policy's."""
+    # long: the functions of a prior close over its settings
     net, size = network(settings.hidden, settings.logit_init, expert.dimension), expert.windows.shape[-1]
     optimizer = optax.chain(
         optax.add_decayed_weights(settings.weight_decay),

@@ -163,6 +163,7 @@ def make_static(expert: Expert, config: Config) -> MotionPrior:
 
 
 def _make(expert: Expert, config: PriorConfig, *, static: bool = False) -> MotionPrior:
+    # long: the functions of a prior close over its settings
     windows, dimension = expert.windows, expert.dimension
     optimizer = optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.adam(config.learning_rate))
     newest = learning.newest_share(config.average_half_life)  # half-life in updates

@@ -90,6 +90,7 @@ def denoising_error(denoise, x: jax.Array, noise: jax.Array, step: jax.Array, si
 
 def make(expert: Expert, config: Config) -> MotionPrior:
     """Score-Matching Motion Prior: how well a frozen diffusion model of the demonstration denoises a window."""
+    # long: the functions of a prior close over its settings
     settings = config.smp
     network = Denoiser(expert.horizon, *SMP_NETWORKS[settings.network])
     optimizer = optax.chain(
