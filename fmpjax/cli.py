@@ -2,9 +2,7 @@
 
 import dataclasses
 import math
-import os
 import sys
-import time
 from pathlib import Path
 from typing import Annotated
 
@@ -15,192 +13,9 @@ from fmpjax import config as configuration
 from fmpjax import experiments, machine, shell, tables
 from fmpjax.cli_deploy import Sim2Sim
 from fmpjax.cli_motion import MOTION
+from fmpjax.cli_train import Train, runs_module
 from fmpjax.errors import UserError
 from fmpjax.shell import default
-
-
-def _setting(key: str) -> object:
-    """For ``Annotated``: the default of an option that overrides a setting, which may depend on the preset."""
-    presets: dict[str, list[str]] = {}
-    for name in configuration.PRESETS:
-        value = configuration.flatten(configuration.preset(name))[key]
-        presets.setdefault(f"{value:,}" if isinstance(value, int) else value, []).append(name)
-    if len(presets) == 1:
-        return default(*presets)
-    return default(", ".join(f"{value} in {' and '.join(names)}" for value, names in presets.items()))
-
-
-@dataclasses.dataclass(frozen=True)
-class Train:
-    """Train a policy from a demonstration."""
-
-    method: Annotated[str | None, _setting("method")] = None
-    """Motion prior; `fmpjax list` shows all of them."""
-    reset: Annotated[str | None, _setting("env.reset")] = None
-    """`dataset` (a demonstration state) or `fixed` (the default pose)."""
-    preset: Annotated[str | None, default("laptop on a CPU, paper on an accelerator")] = None
-    """`smoke`, `laptop` or `paper`."""
-    robot: Annotated[str | None, _setting("robot")] = None
-    """A robot under robots/."""
-    motion: Annotated[str | None, _setting("motion")] = None
-    """A bundled motion's name, a file or a folder of files; several with weights as NAME[:WEIGHT],NAME[:WEIGHT]."""
-    command: Annotated[str | None, default("none, or the run's own with --resume")] = None
-    """What the policy is told: `none`, `velocity` (by default of the motions `gaits`) or `phase`; docs/steering.md."""
-    frames: Annotated[str | None, default("all")] = None
-    """Source rows first:last of the motion, 0-based, both included; of several motions with commas between them."""
-    seed: Annotated[int | None, _setting("seed")] = None
-    """Seed of everything that is random."""
-    seeds: Annotated[int | None, default("a single run")] = None
-    """Train as many seeds at once, from --seed on, in one program: the runs RUN/seed0, RUN/seed1, and so on."""
-    transitions: Annotated[int | None, _setting("transitions")] = None
-    """Budget of environment steps; with --resume, a larger one than the run's lets it go on."""
-    run: Annotated[Path | None, default("runs/METHOD-DATE-TIME")] = None
-    """Folder of the run."""
-    minutes: Annotated[float | None, default("no limit")] = None
-    """Time budget: the run ends cleanly and can be resumed."""
-    devices: int = 1
-    """Devices that share the environments, or the seeds; 0 for every one that JAX sees."""
-    distributed: bool = False
-    """One of several processes that train together on all their devices, as SLURM starts them; see docs/scaling.md."""
-    coordinator: Annotated[str | None, default("as the scheduler says")] = None
-    """HOST:PORT of the first process, where no scheduler tells it."""
-    processes: Annotated[int | None, default("as the scheduler says")] = None
-    """Number of processes, likewise."""
-    process: Annotated[int | None, default("as the scheduler says")] = None
-    """Number of this process, from 0, likewise."""
-    resume: bool = False
-    """Go on with the run in --run, with its settings."""
-    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Any other setting as section.field=value; `fmpjax settings` explains all of them."""
-
-    def __call__(self) -> None:
-        if self.minutes is not None and not self.minutes > 0:
-            raise UserError(f"--minutes is {self.minutes:g}: expected more than 0")
-        if self.seeds is not None and self.seeds < 1:
-            raise UserError(f"--seeds is {self.seeds}: expected at least 1")
-        if self.devices < 0:
-            raise UserError(f"--devices is {self.devices}: expected 0 (for all) or more")
-        began = time.monotonic()
-        self._connect()
-        runs = _runs()
-        devices = None if self.distributed else self.devices or None
-        if self.resume:
-            group = self._resumed()
-            self._extend(group)
-        else:
-            group = self._begun(devices)
-        minutes = None if self.minutes is None else self.minutes - (time.monotonic() - began) / 60
-        end = runs.train(*group, resume=self.resume, minutes=minutes, devices=devices)
-        from fmpjax import sharding
-
-        # Who sends a signal wants the process to end, not to film.
-        if end is not runs.End.SIGNAL and sharding.primary():
-            for run in group:
-                for path in runs.finish(run):
-                    print(f"wrote {path}")
-
-    def _connect(self) -> None:
-        by_hand = (self.coordinator, self.processes, self.process)
-        if not self.distributed:
-            if by_hand != (None, None, None):
-                raise UserError("--coordinator, --processes and --process go with --distributed")
-            return
-        if self.run is None:
-            raise UserError("--distributed needs the run's folder, the same for all processes: name it with --run")
-        from fmpjax import sharding
-
-        sharding.connect(*by_hand)
-
-    def _resumed(self):
-        runs = _runs()
-        if self.run is None:
-            raise UserError("--resume needs the run's folder: name it with --run")
-        changes = self._changes()
-        folders = [path for path in self.run.glob("seed*") if path.is_dir()]
-        folders.sort(key=lambda path: (len(path.name), path.name))
-        if (self.run / "config.json").exists() or not folders:
-            folders = [self.run]
-        elif "seed" in changes:
-            # Some of the seeds: as many as --seeds says, one by default, from --seed on.
-            first = configuration.with_changes(configuration.Config(), {"seed": changes["seed"]}).seed
-            folders = [self.run / f"seed{first + i}" for i in range(self.seeds or 1)]
-        if self.seeds is not None and self.seeds != len(folders):
-            raise UserError(f"run {self.run} has {len(folders)} seeds: it cannot go on with {self.seeds}")
-        group = [runs.Run.open(folder) for folder in folders]
-        saved = configuration.flatten(group[0].config)
-        if self.preset is not None and self.preset != saved["preset"]:
-            raise UserError(f"run {self.run} has preset {saved['preset']!r}: it cannot go on as {self.preset!r}")
-        asked = configuration.flatten(configuration.with_changes(group[0].config, changes))
-        longer = asked["transitions"] > saved["transitions"]
-        for key in changes:
-            if asked[key] != saved[key] and not (key == "transitions" and longer):
-                raise UserError(f"run {self.run} has {key} {saved[key]!r}: it cannot go on with {asked[key]!r}")
-        return group
-
-    def _extend(self, group) -> None:
-        """Give the runs the larger budget that a resume asks for; the first process writes it for all."""
-        from fmpjax import sharding
-
-        budget = configuration.with_changes(group[0].config, self._changes()).transitions
-        for run in group if sharding.primary() else ():
-            if budget > run.config.transitions:
-                run.extend(budget)
-        sharding.wait("extended")
-
-    def _begun(self, devices: int | None):
-        """New runs: the first process makes the folders, the others find them."""
-        from fmpjax import sharding
-
-        group, refused = None, None
-        try:
-            group = self._created(devices) if sharding.primary() else None
-        except UserError as error:
-            refused = error
-        # The others wait here for the folders, and no longer than for a first process that has given up.
-        if not sharding.agree(refused is None):
-            raise refused or UserError("the first process was refused, and says why")
-        return group or self._resumed()
-
-    def _created(self, devices: int | None):
-        runs = _runs()
-        from fmpjax import sharding
-
-        config = configuration.preset(self.preset or runs.default_preset(), **self._changes())
-        runs.check_trainable(config, self.seeds or 1)
-        if devices != 1:
-            sharding.check_divides(config.env.count, self.seeds or 1, sharding.mesh(devices).size)
-        print(runs.describe(config), flush=True)
-        folder = self.run or runs.default_folder(config)
-        if self.seeds is None:
-            return [runs.Run.create(folder, config)]
-        seeds = range(config.seed, config.seed + self.seeds)
-        configs = [configuration.validate(dataclasses.replace(config, seed=seed)) for seed in seeds]
-        return [runs.Run.create(folder / f"seed{each.seed}", each) for each in configs]
-
-    def _changes(self) -> dict[str, object]:
-        named = {
-            "method": self.method,
-            "env.reset": self.reset,
-            "robot": self.robot,
-            "motion": self.motion,
-            "frames": self.frames,
-            "seed": self.seed,
-            "transitions": self.transitions,
-        }
-        from fmpjax.motion import library
-
-        changes: dict[str, object] = {key: value for key, value in named.items() if value is not None}
-        for item in self.set:
-            key, equals, value = item.partition("=")
-            if not equals or key == "preset":
-                raise UserError(f"--set {item!r}: expected section.field=value")
-            changes[key] = value
-        if self.resume:
-            return changes | ({} if self.command is None else {"command.kind": self.command})
-        changes = configuration.commanded(self.command, changes)
-        if isinstance(names := changes.get("motion"), str):
-            changes["motion"] = library.listed(names)
-        return changes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,7 +34,7 @@ class Evaluate:
     def __call__(self) -> None:
         if self.commands:
             return self._commands()
-        runs = _runs()
+        runs = runs_module()
         from fmpjax.evaluate import Evaluator, table
 
         if self.episodes is not None and self.episodes < 1:
@@ -234,7 +49,7 @@ class Evaluate:
         print(f"wrote {run.folder / name}.json")
 
     def _commands(self) -> None:
-        runs = _runs()
+        runs = runs_module()
         from fmpjax import steering
         from fmpjax.files import write
         from fmpjax.viz import heat
@@ -265,7 +80,7 @@ class Render:
     """Leave the demonstration out, whose licence may not let a picture of it be passed on."""
 
     def __call__(self) -> None:
-        runs = _runs()
+        runs = runs_module()
         from fmpjax.evaluate import Evaluator
 
         if not 0 < self.seconds < math.inf:
@@ -289,7 +104,7 @@ class Export:
     """Write policy.onnx and MODEL_CARD.md, too, for other programs; docs/deploy.md."""
 
     def __call__(self) -> None:
-        runs = _runs()
+        runs = runs_module()
         from fmpjax import deploy, features, robots
 
         run = runs.Run.open(self.run)
@@ -326,7 +141,7 @@ class Report:
     """HTML page to write; the same in Markdown stands beside it."""
 
     def __call__(self) -> None:
-        _runs()
+        runs_module()
         from fmpjax.experiments import report
 
         for path in report.write(self.folder, self.out or self.folder / "report.html"):
@@ -376,23 +191,6 @@ class List:
             ("motions", {name: motion.describe(name) for name in motion.bundled()}),
         ):
             print(f"{title}:\n{tables.aligned(list(described.items()), texts=2)}")
-
-
-def _runs():
-    """`fmpjax.runs`, imported when a command needs it."""
-    import jax
-
-    from fmpjax import runs
-
-    machine.keep_compiled()
-    try:
-        jax.devices()
-    except (RuntimeError, AssertionError):  # which of them depends on the plugins that are installed
-        platforms = os.environ.get("JAX_PLATFORMS", "")
-        raise UserError(
-            f"JAX_PLATFORMS is {platforms!r}, and no such device is there: expected cpu, or a device that JAX sees"
-        ) from None
-    return runs
 
 
 def _experiment(name: str, *options: str) -> None:

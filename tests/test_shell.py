@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import fmpjax
-from fmpjax import cli, config, experiments, motion, priors, robots
+from fmpjax import cli, cli_train, config, experiments, motion, priors, robots
 from fmpjax.experiments.common import results
 
 ROOT = Path(fmpjax.__file__).parents[1]
@@ -100,8 +100,8 @@ def test_help_names_the_defaults_of_training(shown):
 
 def test_a_default_that_depends_on_the_preset_says_so(monkeypatch):
     monkeypatch.setattr(config, "PRESETS", config.PRESETS | {"paper": {"robot": "another"}})
-    assert cli._setting("robot").help_behavior_hint == "(default: unitree_g1 in smoke and laptop, another in paper)"
-    assert cli._setting("method").help_behavior_hint == "(default: fmp)"
+    assert cli_train._setting("robot").help_behavior_hint == "(default: unitree_g1 in smoke and laptop, another in paper)"
+    assert cli_train._setting("method").help_behavior_hint == "(default: fmp)"
 
 
 def test_none_is_no_value(capsys):
