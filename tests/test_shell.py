@@ -100,7 +100,8 @@ def test_help_names_the_defaults_of_training(shown):
 
 def test_a_default_that_depends_on_the_preset_says_so(monkeypatch):
     monkeypatch.setattr(config, "PRESETS", config.PRESETS | {"paper": {"robot": "another"}})
-    assert cli_train._setting("robot").help_behavior_hint == "(default: unitree_g1 in smoke and laptop, another in paper)"
+    said = cli_train._setting("robot").help_behavior_hint
+    assert said == "(default: unitree_g1 in smoke and laptop, another in paper)"
     assert cli_train._setting("method").help_behavior_hint == "(default: fmp)"
 
 
