@@ -38,7 +38,7 @@ TINY = {
     "evaluation_episodes": 4,
     "env.count": 8,
     "env.first_cap": 20,
-    "env.episode_steps": 60,
+    "env.episode_steps": 40,
     "prior.bank": 16,
     "prior.minibatch": 16,
     "prior.hidden": (16, 16),
@@ -207,7 +207,7 @@ def test_finish_writes_evaluation_curves_and_video(trained, capsys):
     assert all(p.is_file() and p.stat().st_size > 0 for p in paths)
     assert {"evaluation.json", "curves.png"} <= {p.name for p in paths}
     evaluation = json.loads((trained / "evaluation.json").read_text())
-    assert evaluation["episodes"] == 4 and 0 <= evaluation["falls"] <= 4 and 0 < evaluation["mean_length"] <= 60
+    assert evaluation["episodes"] == 4 and 0 <= evaluation["falls"] <= 4 and 0 < evaluation["mean_length"] <= 40
     # The best checkpoint's figures are those that training logged when it chose it.
     iteration = Checkpoints(trained).latest(best=True)
     logged = next(r for r in rows(trained) if int(r["iteration"]) == iteration)
@@ -493,12 +493,12 @@ def fallen(trainer, evaluator):
 
 @pytest.mark.slow
 def test_a_policy_that_falls_is_counted_to_its_fall(trainer, evaluator, fallen):
-    assert fallen.qpos.shape == (60, 6, 7 + trainer.robot.joint_count)
-    assert fallen.fell.all() and (fallen.length > 2).all() and (fallen.length < 60).all()
+    assert fallen.qpos.shape == (40, 6, 7 + trainer.robot.joint_count)
+    assert fallen.fell.all() and (fallen.length > 2).all() and (fallen.length < 40).all()
     for i, length in enumerate(fallen.length):
         # The fall is on the last step that counts; after it nothing moves.
         observed = trainer.env._observe(jnp.asarray(fallen.qpos[:, i]), jnp.asarray(fallen.qvel[:, i]))
-        expected = np.arange(60) >= length - 1
+        expected = np.arange(40) >= length - 1
         np.testing.assert_array_equal(observed.fallen, expected)
         assert (fallen.qpos[length - 1 :, i] == fallen.qpos[length - 1, i]).all()
         assert np.any(fallen.qpos[length - 2, i] != fallen.qpos[length - 1, i])
@@ -606,7 +606,7 @@ def test_a_video_is_as_long_as_it_is_asked_to_be(trainer, fallen, tmp_path, monk
     render = runs.outputs.render
     monkeypatch.setattr(render, "grid", lambda robot, motions, labels, **_: shown.extend(map(len, motions)))
     monkeypatch.setattr(render, "write_video", lambda path, frames, fps: path)
-    runs.video(runs.Run(tmp_path), trainer, fallen._replace(length=np.full(6, 60)), seconds=0.4)
+    runs.video(runs.Run(tmp_path), trainer, fallen._replace(length=np.full(6, 40)), seconds=0.4)
     assert shown == [10, 10]  # 20 steps of 0.02 s, every second one
 
 
