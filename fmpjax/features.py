@@ -8,6 +8,7 @@ what it was, and so what SGD does to a first layer. Adam, which moves every weig
 share of a sum 1/sqrt(2) as fast as it would move the two.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -78,6 +79,7 @@ def _joint_rotations(robot: Robot, joints: jax.Array) -> jax.Array:
     return rows.reshape(*rows.shape[:-2], -1)
 
 
+@partial(jax.jit, static_argnames=("robot",), inline=True)
 def actor_observation(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """The policy's observation, ``[..., 237]`` for the G1.
 
@@ -139,6 +141,7 @@ def _observation(robot: Robot, p: _Parts, form: str) -> jax.Array:
     return jnp.concatenate([parts[name] for name in observation_terms(robot, form) if name in parts], axis=-1)
 
 
+@partial(jax.jit, static_argnames=("robot",), inline=True)
 def prior_window(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """The prior's window before normalisation, ``[..., H * 239]`` for the G1, oldest frame first.
 
@@ -188,6 +191,7 @@ def _turned(p: _Parts) -> _Parts:
     return p._replace(**{name: turn(getattr(p, name)) for name in names})
 
 
+@partial(jax.jit, static_argnames=("robot", "form"), inline=True)
 def observe(robot: Robot, qpos: jax.Array, qvel: jax.Array, form: str) -> Observed:
     """The policy's observation, the compact frame and the fall test of states ``qpos``, ``qvel``.
 

@@ -5,6 +5,7 @@ ancestor 2^r levels up, so a tree of depth D takes log2(D) rounds of batched qua
 second, where an unrolled chain of 30 bodies takes minutes.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -22,6 +23,7 @@ class BodyPoses(NamedTuple):
     rotation_wxyz: jax.Array  # [..., B, 4]
 
 
+@partial(jax.jit, static_argnames=("robot",), inline=True)
 def body_poses(robot: Robot, qpos: jax.Array) -> BodyPoses:
     """Body poses of ``qpos [..., 7 + J]`` (root xyz m, root quaternion wxyz, joints rad)."""
     state = jnp.moveaxis(qpos, -1, 0)  # components first: a kernel then reads and writes whole rows
