@@ -188,7 +188,7 @@ class List:
             ("methods", priors.descriptions()),
             ("presets", configuration.DESCRIPTIONS),
             ("robots", {name: robots.load(name).description for name in robots.available()}),
-            ("motions", {name: motion.describe(name) for name in motion.bundled()}),
+            ("motions", {name: motion.describe(name) for name in motion.bundled()} | motion.folders()),
         ):
             print(f"{title}:\n{tables.aligned(list(described.items()), texts=2)}")
 

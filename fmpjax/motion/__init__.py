@@ -1,7 +1,7 @@
 """Demonstrations: reading, resampling, writing, and a synthesised walk (`fmpjax.motion.gait`)."""
 
 from fmpjax.motion.clip import MotionClip, resample, velocities
-from fmpjax.motion.formats import bundled, load, save
+from fmpjax.motion.formats import bundled, folders, load, save
 from fmpjax.motion.library import MotionLibrary, describe, load_library
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "MotionLibrary",
     "bundled",
     "describe",
+    "folders",
     "load",
     "load_library",
     "resample",

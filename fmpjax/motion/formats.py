@@ -27,6 +27,12 @@ def bundled() -> list[str]:
     return sorted(p.stem for p in resources.folder("motions").glob("*.npz"))
 
 
+def folders() -> dict[str, str]:
+    """The shipped folders of motions, each with what it holds."""
+    found = {p.name: len(list(p.glob("*.npz"))) for p in sorted(resources.folder("motions").iterdir()) if p.is_dir()}
+    return {name: f"unitree_g1, a folder of {count} walks, turns and standing" for name, count in found.items()}
+
+
 def load(
     path: str | os.PathLike,
     *,
