@@ -78,16 +78,17 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
         return Told(Velocity(value, jnp.where(over, drawn.left, state.left - 1), off), never, reward(off))
 
     def reward(off):
-        linear = jnp.exp(-(off[..., :2] ** 2).sum(-1) / config.speed_width**2)
-        turning = jnp.exp(-((off[..., 2] / config.turn_width) ** 2))
+        # Unlike a Gaussian's, the slope does not vanish for errors many widths large.
+        linear = 1.0 / (1.0 + (off[..., :2] ** 2).sum(-1) / config.speed_width**2)
+        turning = 1.0 / (1.0 + (off[..., 2] / config.turn_width) ** 2)
         return (1.0 - config.turn_share) * linear + config.turn_share * turning
 
     return Command(3, draw, begin, advance, lambda state: state.value)
 
 
 def extent(config: CommandConfig, library: MotionLibrary) -> np.ndarray:
-    """Lowest and highest commanded velocity, ``[2, 3]`` (m/s, m/s, rad/s), zero included."""
-    own = np.concatenate([velocities(clip) for clip in library.clips])
+    """Lowest and highest commanded velocity, ``[2, 3]`` (m/s, m/s, rad/s), zero included; of clips their means."""
+    own = np.stack([velocities(clip).mean(0) for clip in library.clips]).round(2)
     spans = own if config.ranges is None else np.transpose(config.ranges)
     return np.stack([np.minimum(spans.min(0), 0.0), np.maximum(spans.max(0), 0.0)])
 

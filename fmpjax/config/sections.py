@@ -100,8 +100,8 @@ class CommandConfig(Section):
     sideways: tuple[float, ...] = ()  # m/s, the same to the left; empty for none where another range is given [D]
     turn: tuple[float, ...] = ()  # rad/s, the same of turning to the left [D]
     average: PositiveFloat = 0.5  # s, time constant of the running mean of the errors [D: half a stride]
-    speed_width: PositiveFloat = 0.35  # m/s, error at which the reward of the speed falls to 1/e [D]
-    turn_width: PositiveFloat = 0.35  # rad/s, error at which the reward of the turning falls to 1/e [D]
+    speed_width: PositiveFloat = 0.25  # m/s, error at which the reward of the speed falls to a half [D]
+    turn_width: PositiveFloat = 0.25  # rad/s, error at which the reward of the turning falls to a half [D]
     turn_share: Fraction = 0.5  # of the turning in the reward [D]
 
     @property
