@@ -79,8 +79,8 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 4, changing: i
     rng, rate = np.random.default_rng(seed), trainer.config.control_rate
     low, high = velocity.extent(config, library)
     speeds, turns = np.linspace(low[0], high[0], SPEEDS), np.linspace(low[2], high[2], TURNS)
-    if low[2] < 0 < high[2]:
-        turns[np.abs(turns).argmin()] = 0.0  # straight ahead is one of them
+    for values in (speeds, turns):
+        values[np.abs(values).argmin()] = 0.0  # standing and straight ahead are among them: zero is within the extent
     grid = np.array([(v, 0.0, w) for v in speeds for w in turns])
     told = np.repeat(grid, episodes, axis=0)[None]
     steps = round(CONSTANT * rate)
