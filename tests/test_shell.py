@@ -99,7 +99,7 @@ def test_help_names_the_defaults_of_training(shown):
 
 
 def test_a_default_that_depends_on_the_preset_says_so(monkeypatch):
-    monkeypatch.setattr(config, "PRESETS", config.PRESETS | {"paper": {"robot": "another"}})
+    monkeypatch.setattr(config.presets, "PRESETS", config.PRESETS | {"paper": {"robot": "another"}})
     said = cli_train._setting("robot").help_behavior_hint
     assert said == "(default: unitree_g1 in smoke and laptop, another in paper)"
     assert cli_train._setting("method").help_behavior_hint == "(default: fmp)"
@@ -131,7 +131,7 @@ def test_list_describes_everything(capsys):
         "methods": priors.METHODS,
         "presets": config.PRESETS,
         "robots": robots.available(),
-        "motions": motion.bundled(),
+        "motions": [*motion.bundled(), *motion.folders()],
     }
     assert {title: list(found) for title, found in groups.items()} == {k: list(names) for k, names in expected.items()}
     texts = [text for found in groups.values() for text in found.values()]
