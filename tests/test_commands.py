@@ -15,7 +15,7 @@ from fmpjax.config import CommandConfig, preset
 from fmpjax.env import Env
 from fmpjax.errors import UserError
 from fmpjax.frames import FrameLayout
-from fmpjax.motion import MotionClip, MotionLibrary, library
+from fmpjax.motion import MotionClip, MotionLibrary, gait, library
 from fmpjax.sim2sim.observation import TERMS
 from fmpjax.trainer import Trainer
 
@@ -236,6 +236,22 @@ def test_the_shipped_gaits_move_as_their_names_say():
     for clip in found.clips:
         ahead, turn = map(float, clip.name.rsplit("/")[-1].split("_"))
         np.testing.assert_allclose(velocity.velocities(clip).mean(0), [ahead, 0.0, turn], atol=0.03)
+
+
+def test_a_shipped_gait_is_the_generators(robot):
+    made = gait.make(robot, gait.Command(0.8, 0.0, 0.4)).clip(4.0)
+    np.testing.assert_allclose(motion.load("gaits/+0.80_+0.40").qpos, made.qpos, atol=1e-6)
+
+
+def test_a_grid_of_gaits_is_a_folder(tmp_path, capsys):
+    """What is out of reach is said and left out; a file is no folder."""
+    out = ["motion", "synthesize", "--grid", "--out", str(tmp_path / "mine"), "--duration", "2", "--turns", "0"]
+    cli.main([*out, "--speeds", "0", "9"])
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["+0.00_+0.00.npz"]
+    assert "left out: speed 9 m/s is out of the legs' reach" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["motion", "synthesize", "--grid", "--out", str(tmp_path / "mine.npz")])
+    assert stop.value.code == 2 and "expected a folder with --grid" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
