@@ -226,6 +226,7 @@ def test_a_folder_is_a_list_of_its_motions(tmp_path):
     assert library.listed(f"{tmp_path}:3,walk") == f"{tmp_path}/a.npz:1.5,{tmp_path}/b.npz:1.5,walk"
     gaits = library.listed("gaits").split(",")
     assert len(gaits) > 20 and all(name.startswith("gaits/") for name in gaits)
+    assert [library.title(name) for name in ("gaits/+0.40_-0.80", "/a/b.npz", "walk")] == ["+0.40_-0.80", "b", "walk"]
     (tmp_path / "none").mkdir()
     with pytest.raises(UserError, match="none holds no motion files: expected some that end in .npz"):
         library.listed(str(tmp_path / "none"))

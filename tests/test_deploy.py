@@ -34,11 +34,12 @@ needs_onnx = pytest.mark.skipif(not importable("onnx", "onnxruntime"), reason="t
 def small(robot, walk, **changes):
     """An untrained policy of random layers, and what a run has beside it."""
     settings = tiny(**changes)
-    size, random = sum(features.observation_terms(robot, settings.env.observation).values()), np.random.default_rng(0)
+    form = features.observation_form(settings)
+    size, random = sum(features.observation_terms(robot, form).values()), np.random.default_rng(0)
     shapes = [(size, 16), (16, 12), (12, robot.joint_count)]
     made = policy.Policy(
         joint_names=robot.joint_names,
-        observation=settings.env.observation,
+        observation=form,
         rate=settings.control_rate,
         activation=settings.ppo.activation,
         kernels=tuple(random.normal(0, 0.5 / np.sqrt(shape[0]), shape).astype(np.float32) for shape in shapes),
@@ -103,7 +104,8 @@ def test_onnxruntime_says_what_the_networks_say(tmp_path, robot, walk):
     observations = np.random.default_rng(1).normal(0, 3, (20, made.size)).astype(np.float32)
     state, wanted = network(observations)
     actions = action_map(robot, walk, made.config.env.action)
-    trainer = SimpleNamespace(config=made.config, robot=robot, ppo=ppo, env=SimpleNamespace(actions=actions))
+    env = SimpleNamespace(actions=actions, form="compact")
+    trainer = SimpleNamespace(config=made.config, robot=robot, ppo=ppo, env=env)
     taken = policy.of(trainer, state)
     by_onnx, given = targets(deploy.write(tmp_path, taken, robot, made.origin)[0], observations)
     np.testing.assert_allclose(
@@ -303,11 +305,16 @@ def without_a_floor(root):
         world.remove(geom)
 
 
-@pytest.fixture(scope="module", params=["compact", "full"])
+TOLD = np.array([0.5, 0.0, 0.4])  # m/s ahead and to the left, rad/s
+
+
+@pytest.fixture(scope="module", params=["compact", "full", "compact heading velocity"])
 def trained(request, robot, walk, tmp_path_factory):
     """Six steps of training's own physics under a small policy, and the file of that policy."""
     pytest.importorskip("onnxruntime")
-    changes = {"env.observation": request.param, "physics.timestep": 0.005, "physics.substeps": 4, "physics.threads": 1}
+    content, *told = request.param.split()
+    changes = {"env.observation": content, "physics.timestep": 0.005, "physics.substeps": 4, "physics.threads": 1}
+    changes |= {"env.axes": "heading", "command.kind": "velocity"} if told else {}
     made = small(robot, walk, **changes)
     folder = tmp_path_factory.mktemp("policy")
     made.path, _ = deploy.write(folder, made.policy, robot, made.origin)
@@ -316,7 +323,8 @@ def trained(request, robot, walk, tmp_path_factory):
     observe, step = jax.jit(lambda *x: features.observe(robot, *x, request.param).actor), jax.jit(native.step)
     made.observations, made.states = [], []
     for _ in range(6):
-        made.observations.append(np.asarray(observe(state.qpos, state.qvel))[0])
+        command = TOLD if told else []
+        made.observations.append(np.concatenate([observe(state.qpos, state.qvel)[0], command]).astype(np.float32))
         state = step(state, jnp.asarray(made.policy(made.observations[-1])[None]))
         made.states.append(np.concatenate([state.qpos[0], state.qvel[0]]))
     made.options = {
@@ -341,10 +349,11 @@ def test_the_first_steps_are_those_of_training(trained, robot, tmp_path, edit):
         edit(root)
 
     sim = sim2sim.Simulation(sim2sim.load(trained.path), mjcf(robot, tmp_path / "g1.xml", edited, **trained.options))
+    sim.command = TOLD
     for observation, state in zip(trained.observations, trained.states, strict=True):
         np.testing.assert_allclose(sim.observe(), observation, atol=1e-5)
         assert not sim.step()
-        np.testing.assert_allclose(np.concatenate([sim.qpos, sim.qvel]), state, atol=1e-5)
+        np.testing.assert_allclose(np.concatenate([sim.qpos, sim.qvel]), state, atol=2e-5)
     said = {
         in_another_order: "joints stand in another order",
         without_a_floor: "no floor: one was added",

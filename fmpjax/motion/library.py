@@ -100,6 +100,12 @@ def load_library(
     return MotionLibrary(clips, shares(entries))
 
 
+def title(name: str) -> str:
+    """A motion's name without its folder and the ending of a file."""
+    path = Path(name)
+    return path.stem if path.suffix in SUFFIXES else path.name
+
+
 def listed(names: str) -> str:
     """A list of motions in which each folder, one's own or a shipped one, is replaced by the motion files in it.
 

@@ -170,7 +170,8 @@ class Run:
         motions = self.motions(config)
         clips = [
             dataclasses.replace(
-                motion.load(path, rate=round(config.control_rate, 6), robot=config.robot), name=Path(name).stem
+                motion.load(path, rate=round(config.control_rate, 6), robot=config.robot),
+                name=motion.library.title(name),
             )
             for path, (name, _) in zip(self._demonstration_files(len(motions)), motions, strict=True)
         ]
