@@ -80,7 +80,7 @@ def test_missing_specification_and_unknown_names(tmp_path):
         cells.read_specification(tmp_path / "none.toml")
     with pytest.raises(UserError, match="unknown method 'gan'"):
         cells.plan(cells.Specification(methods=("gan",)))
-    with pytest.raises(UserError, match="unknown reset 'random'"):
+    with pytest.raises(UserError, match="setting env.reset is 'random': expected one of dataset, fixed"):
         cells.plan(cells.Specification(resets=("random",)))
     with pytest.raises(UserError, match=r"unknown setting 'ppo.gamma'"):
         cells.plan(cells.Specification(settings={"ppo.gamma": 0.9}))
