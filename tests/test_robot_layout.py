@@ -120,7 +120,7 @@ def test_it_is_observed_the_same(strider, retold, order, walks):
     frames = []
     for robot, clip in zip((strider, retold), walks, strict=True):
         qpos, qvel = (jnp.asarray(x[::8], jnp.float32) for x in (clip.qpos, clip.qvel))
-        observed = jax.jit(functools.partial(features.observe, robot, observation="full"))(qpos, qvel)
+        observed = jax.jit(functools.partial(features.observe, robot, form="full"))(qpos, qvel)
         assert observed.actor.shape[-1] == 1 + 6 + 6 + 7 * 12 + 9
         frames.append(np.asarray(observed.frame))
     where = np.concatenate([np.arange(9), 9 + order, 21 + order, np.arange(33, 48), 48 + order])
