@@ -51,6 +51,8 @@ def train(
             raise UserError("resume continues a run with its own settings: expected its folder and no settings")
         run = Run.open(folder)
     else:
+        if config is not None and command is not None:
+            raise UserError("command goes with a preset: of a Config, set command.kind, motion and the axes yourself")
         run = _created(config, preset, folder, configuration.commanded(command, settings))
     left = None if minutes is None else minutes - (time.monotonic() - began) / 60
     if runs.train(run, resume=resume, minutes=left) is not runs.End.SIGNAL:

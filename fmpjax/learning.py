@@ -14,12 +14,11 @@ Initializer = Callable[..., jax.Array]
 
 
 class MLP(linen.Module):
-    """Dense layers, an activation after each; after the last one only where ``activate_last``."""
+    """Dense layers, an activation after each but the last."""
 
     widths: Sequence[int]
     kernel_inits: Sequence[Initializer]  # of each layer
     activation: Callable[[jax.Array], jax.Array]
-    activate_last: bool = False
     names: Sequence[str] = ()  # of the layers' parameters; hidden_0, hidden_1 and so on by default
 
     @linen.compact
@@ -29,7 +28,7 @@ class MLP(linen.Module):
         last = len(self.widths) - 1
         for i, (width, init, name) in enumerate(zip(self.widths, self.kernel_inits, names, strict=True)):
             x = linen.Dense(width, kernel_init=init, name=name)(x)
-            if i < last or self.activate_last:
+            if i < last:
                 x = self.activation(x)
         return x
 

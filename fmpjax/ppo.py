@@ -1,7 +1,7 @@
 """Proximal policy optimisation (section IV-A of the paper; the settings are MimicKit's).
 
-Hidden layers, the critic and the running statistics of observations are Brax's. An update fits the critic to TD(lambda)
-returns first and then improves the actor, each for its own number of epochs.
+Hidden layers, the critic, the action distribution and the running statistics of observations are Brax's. An update fits
+the critic to TD(lambda) returns first and then improves the actor, each for its own number of epochs.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +19,8 @@ from fmpjax.config import PPOConfig
 
 machine.import_mjx()  # which Brax imports
 
-from brax.training.acme import running_statistics  # noqa: E402 - after MJX
+from brax.training import distribution  # noqa: E402 - after MJX
+from brax.training.acme import running_statistics  # noqa: E402
 from brax.training.acme.running_statistics import RunningStatisticsState  # noqa: E402
 from brax.training.networks import MLP  # noqa: E402
 from brax.training.types import UInt64  # noqa: E402
@@ -93,6 +94,7 @@ class PPO:
         kernel = initializers.orthogonal(2.0**0.5) if config.orthogonal else uniform
         self._actor = Actor(action_size, config.hidden, activation, kernel, config.mean_init, config.deviation)
         self._critic = MLP((*config.hidden, 1), activation, kernel)
+        self._distribution = distribution.NormalDistribution(action_size)
         clip = [optax.clip_by_global_norm(config.clip_norm)] if config.clip_norm else []
         self._optimizer = optax.chain(*clip, learning.direction(config.optimizer, config.momentum))
 
@@ -191,12 +193,15 @@ class PPO:
         def actor_loss(params, sample):
             samples, _, gain = sample
             mean, deviation = self.policy(params, state.normalizer, samples.observation)
-            old = log_probability(samples.action, samples.mean, samples.deviation)
-            ratio = jnp.exp(log_probability(samples.action, mean, deviation) - old)
+            new, old = (mean, deviation), (samples.mean, samples.deviation)
+            log_ratio = self._distribution.log_prob(new, samples.action) - self._distribution.log_prob(
+                old, samples.action
+            )
+            ratio = jnp.exp(log_ratio)
             clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
             surrogate = -jnp.mean(jnp.minimum(ratio * gain, clipped * gain))
             bound = jnp.mean(jnp.sum(jnp.maximum(jnp.abs(mean) - 1.0, 0.0) ** 2, axis=-1))
-            kl = kl_divergence(samples.mean, samples.deviation, mean, deviation)
+            kl = self._distribution.create_dist(new).kl_divergence(self._distribution.create_dist(old))
             stats = {
                 "kl": jnp.mean(kl),
                 "clipped": jnp.mean((jnp.abs(ratio - 1.0) > config.clip).astype(ratio.dtype)),
@@ -256,22 +261,6 @@ class PPO:
         summary = {name: values[-minibatches:].mean() for name, values in stats.items()}
         summary["skipped"] = stats["skipped"].sum()
         return params, optimizer_state, summary
-
-
-def log_probability(action: jax.Array, mean: jax.Array, deviation: jax.Array) -> jax.Array:
-    """Logarithm of the density ``[...]`` of actions ``[..., J]`` whose joints are normal and independent."""
-    density = -0.5 * jnp.square(action / deviation - mean / deviation)
-    return jnp.sum(density - (0.5 * jnp.log(2.0 * jnp.pi) + jnp.log(deviation)), axis=-1)
-
-
-def kl_divergence(old_mean, old_deviation, mean, deviation) -> jax.Array:
-    """Divergence ``[...]`` of the old normal distribution from the new one, each ``[..., J]``.
-
-    The ratio of deviations is off by 1e-5: two equal distributions are J * 1e-5 apart.
-    """
-    squares = jnp.square(old_deviation) + jnp.square(old_mean - mean)
-    terms = jnp.log(deviation / old_deviation + 1e-5) + squares / (2.0 * jnp.square(deviation)) - 0.5
-    return jnp.sum(terms, axis=-1)
 
 
 def capped(statistics: RunningStatisticsState, most: int) -> RunningStatisticsState:

@@ -96,6 +96,11 @@ def test_train_takes_a_configuration_and_changes_and_resumes(trained):
         ({"methd": "fmp"}, "unknown setting 'methd': did you mean 'method'"),
         ({"config": "smoke"}, "config is 'smoke' and preset is None: expected a Config or the name of a preset"),
         ({"config": fmpjax.preset("smoke"), "preset": "paper"}, "preset is 'paper': expected a Config or the name of"),
+        (
+            {"config": fmpjax.preset("smoke"), "command": "velocity"},
+            "command goes with a preset: of a Config",
+        ),
+        ({"command": "speed"}, "command is 'speed': expected one of none, velocity, phase"),
         ({"method": "fpm"}, "fpm"),
         ({"resume": True}, "resume continues a run with its own settings: expected its folder and no settings"),
         ({"resume": True, "folder": "one", "seed": 1}, "resume continues a run with its own settings"),

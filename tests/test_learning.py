@@ -34,13 +34,11 @@ def test_every_row_stands_everywhere_equally_often():
 
 def test_a_network_is_its_layers_one_after_another():
     x = jax.random.normal(jax.random.PRNGKey(0), (7, 3))
-    for last in (False, True):
-        network = MLP((4, 2), [learning.uniform(0.5), learning.uniform(0.1)], jnp.tanh, activate_last=last)
-        params = network.init(jax.random.PRNGKey(1), x)
-        first, second = (params["params"][name]["kernel"] for name in ("hidden_0", "hidden_1"))
-        assert 0.1 < np.abs(first).max() <= 0.5 and np.abs(second).max() <= 0.1
-        expected = np.tanh(x @ first) @ second
-        np.testing.assert_allclose(network.apply(params, x), np.tanh(expected) if last else expected, atol=1e-6)
+    network = MLP((4, 2), [learning.uniform(0.5), learning.uniform(0.1)], jnp.tanh)
+    params = network.init(jax.random.PRNGKey(1), x)
+    first, second = (params["params"][name]["kernel"] for name in ("hidden_0", "hidden_1"))
+    assert 0.1 < np.abs(first).max() <= 0.5 and np.abs(second).max() <= 0.1
+    np.testing.assert_allclose(network.apply(params, x), np.tanh(x @ first) @ second, atol=1e-6)
 
 
 @pytest.mark.parametrize("rate", [None, 0.1])
