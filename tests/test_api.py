@@ -11,8 +11,8 @@ import pytest
 
 import fmpjax
 from fmpjax import runs
+from tests.helpers import ROOT
 
-ROOT = Path(fmpjax.__file__).parents[1]
 PAGE = (ROOT / "docs" / "api.md").read_text()
 
 

@@ -13,8 +13,9 @@ from fmpjax import kinematics, physics, priors, robots
 from fmpjax.config import Config, PriorConfig, preset
 from fmpjax.errors import UserError
 from fmpjax.physics.native import NativePhysics
+from tests.helpers import ROOT
 
-PAGE = Path(__file__).resolve().parent.parent / "docs" / "extending.md"
+PAGE = ROOT / "docs" / "extending.md"
 
 
 def example(name):

@@ -1,9 +1,9 @@
 """Rules of the house that a machine can check: the length of files and functions."""
 
 import ast
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+from tests.helpers import ROOT
+
 MOST_LINES = {"file": 400, "function": 60}
 
 

@@ -3,19 +3,16 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-import fmpjax
 from fmpjax import machine
-
-ROOT = Path(fmpjax.__file__).parents[1]
+from tests.helpers import ROOT
 
 # A system with neither an affinity nor /proc nor /sys, as macOS is, before anything of the package is imported. Where
 # there is no fcntl, what trains goes without its lock.
 _BARE = """
-import builtins, os, sys
+import builtins, io, os, sys
 for name in ("process_cpu_count", "sched_getaffinity", "sched_setaffinity"):
     if hasattr(os, name):
         delattr(os, name)
@@ -26,7 +23,7 @@ real = open
 def bare(file, *arguments, **options):
     assert not str(file).startswith(("/proc", "/sys")), file
     return real(file, *arguments, **options)
-builtins.open = bare
+builtins.open = io.open = bare
 """
 
 

@@ -4,12 +4,12 @@ import dataclasses
 
 import jax
 import pytest
-from test_train import tiny
 
 from fmpjax import cli, machine, memory, motion, runs
 from fmpjax.config import preset
 from fmpjax.errors import UserError
 from fmpjax.trainer import Trainer
+from tests.helpers import tiny
 
 # Temporary and argument bytes by `compiled.memory_analysis()`, in MB, on a CPU: JAX 0.10.2, the bundled walk.
 MEASURED = {

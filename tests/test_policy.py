@@ -3,11 +3,11 @@
 import jax
 import numpy as np
 import pytest
-from test_train import tiny
 
 from fmpjax import motion, policy
 from fmpjax.errors import UserError
 from fmpjax.trainer import Trainer
+from tests.helpers import tiny
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from fmpjax import transport
+from tests.helpers import ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
 IMPORTED_AS = {
     "imageio-ffmpeg": "imageio_ffmpeg", "mujoco-mjx": "mujoco", "orbax-checkpoint": "orbax", "ott-jax": "ott",
     "pillow": "PIL",

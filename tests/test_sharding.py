@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_train import TINY, settings, tiny
 
 from fmpjax import cli, motion, priors, runs, sharding
 from fmpjax.errors import UserError
 from fmpjax.trainer import Trainer, stack, unstack
+from tests.helpers import TINY, settings, tiny
 
 DEVICES = 4
 

@@ -6,15 +6,13 @@ import pkgutil
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 import fmpjax
 from fmpjax import cli, cli_train, config, experiments, motion, priors, robots
 from fmpjax.experiments.common import results
-
-ROOT = Path(fmpjax.__file__).parents[1]
+from tests.helpers import ROOT
 
 
 def _experiments():

@@ -10,7 +10,7 @@ import pytest
 from fmpjax import cli, features, kinematics, motion, robots, runs
 from fmpjax.errors import UserError
 from fmpjax.motion import check, edit, gait, retarget
-from tests.test_train import TINY, settings
+from tests.helpers import TINY, settings
 
 JOINTS, KEYS = 12, 3
 

@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 from tensorboardX.proto.event_pb2 import Event
 
-import fmpjax
 from fmpjax import cli, config, policy, runs
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.config import preset
@@ -29,39 +28,11 @@ from fmpjax.evaluate import Episodes, Evaluation, Evaluator
 from fmpjax.logs import MetricsLog
 from fmpjax.priors import Expert
 from fmpjax.trainer import Trainer
-
-# Eight environments, eight steps, five chunks of two iterations: a second of training after the compilation.
-TINY = {
-    "transitions": 8 * 8 * 10,
-    "chunk": 2,
-    "evaluations": (0.4, 1.0),
-    "evaluation_episodes": 4,
-    "env.count": 8,
-    "env.first_cap": 20,
-    "env.episode_steps": 40,
-    "prior.bank": 16,
-    "prior.minibatch": 16,
-    "prior.hidden": (16, 16),
-    "ppo.rollout_steps": 8,
-    "ppo.hidden": (16,),
-    "ppo.critic_epochs": 2,
-    "ppo.actor_epochs": 2,
-}
-ROOT = str(Path(fmpjax.__file__).parents[1])
-
-
-def tiny(**changes):
-    return preset("smoke", **(TINY | changes))
+from tests.helpers import ROOT, TINY, settings, tiny
 
 
 def command(*arguments):
     return [sys.executable, "-m", "fmpjax.cli", *map(str, arguments)]
-
-
-def settings(values):
-    """The command line's form of settings."""
-    text = {k: ",".join(map(str, v)) if isinstance(v, tuple) else v for k, v in values.items()}
-    return [word for key, value in text.items() for word in ("--set", f"{key}={value}")]
 
 
 def rows(run):
@@ -237,7 +208,7 @@ def test_a_resume_in_a_new_process_is_exact(trained, stopped):
     assert Checkpoints(stopped).latest() == 2 and len(rows(stopped)) == 1
     done = subprocess.run(
         command("train", "--resume", "--run", stopped),
-        env=os.environ | {"PYTHONPATH": ROOT},
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         timeout=500,
@@ -284,7 +255,7 @@ def test_sigterm_saves_and_ends_well(tmp_path):
     changes = TINY | {"transitions": 64 * 20_000, "evaluations": (1.0,)}
     process = subprocess.Popen(
         command("train", "--preset", "smoke", "--run", folder, *settings(changes)),
-        env=os.environ | {"PYTHONPATH": ROOT},
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -14,6 +14,7 @@ from fmpjax import config as configuration
 from fmpjax.config import explaining, reading
 from fmpjax.errors import UserError
 from fmpjax.trainer import Trainer
+from tests.helpers import ROOT
 
 
 def test_paper_preset_is_the_paper():
@@ -234,5 +235,5 @@ def test_an_unknown_section_is_named(capsys, arguments, words):
 
 def test_the_page_of_settings_is_what_the_command_prints(capsys):
     cli.main(["settings", "--markdown"])
-    page = Path(__file__).parents[1] / "docs" / "settings.md"
+    page = ROOT / "docs" / "settings.md"
     assert capsys.readouterr().out == page.read_text(), "run: fmpjax settings --markdown > docs/settings.md"

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_train import TINY, settings
 
 from fmpjax import cli, commands, config, features, motion, physics, rotations, runs, steering
 from fmpjax.commands import phase, velocity
@@ -18,6 +17,7 @@ from fmpjax.frames import FrameLayout
 from fmpjax.motion import MotionClip, MotionLibrary, gait, library
 from fmpjax.sim2sim.observation import TERMS
 from fmpjax.trainer import Trainer
+from tests.helpers import TINY, settings
 
 RATE = 50.0
 

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from test_train import tiny
 
 from fmpjax import cli, config, deploy, features, physics, policy, resources, robots, runs
 from fmpjax.config import preset
@@ -22,6 +21,7 @@ from fmpjax.env import action_map
 from fmpjax.errors import UserError
 from fmpjax.physics.native import NativePhysics
 from fmpjax.ppo import PPO
+from tests.helpers import tiny
 
 
 def importable(*names):

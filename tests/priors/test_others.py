@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_comparators import COUNT, SMALL, STEPS, expert_of, rollout_of
-from test_train import tiny
 
 from fmpjax import config as configuration
 from fmpjax import motion, priors, transport
@@ -16,6 +14,7 @@ from fmpjax.config import preset
 from fmpjax.errors import UserError
 from fmpjax.priors import MotionPrior, Rollout, pwil, smp, wail
 from fmpjax.trainer import Trainer
+from tests.helpers import COUNT, SMALL, STEPS, expert_of, rollout_of, tiny
 
 
 def changed(section, **values):

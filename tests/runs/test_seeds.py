@@ -4,11 +4,11 @@ import csv
 
 import numpy as np
 import pytest
-from test_train import TINY, settings, tiny
 
 from fmpjax import cli, runs
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.errors import UserError
+from tests.helpers import TINY, settings, tiny
 
 pytestmark = pytest.mark.slow
 

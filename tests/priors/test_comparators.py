@@ -10,32 +10,10 @@ import pytest
 
 from fmpjax import priors, transport
 from fmpjax.checkpoint import Checkpoints
-from fmpjax.config import AMPConfig, Config, EnvConfig, GAILConfig, PriorConfig, SMPConfig, WAILConfig
-from fmpjax.priors import Expert, Rollout, adversary, amp, barycentric, empirical
+from fmpjax.config import AMPConfig
+from fmpjax.priors import Expert, adversary, amp, barycentric, empirical
 from fmpjax.trainer import TrainState
-
-STEPS, COUNT = 8, 32  # of a rollout
-SMALL = Config(
-    prior=PriorConfig(bank=32, minibatch=32, updates=1, hidden=(16,), score_banks=3),
-    amp=AMPConfig(hidden=(16,), updates=4, minibatch=32, replay=400, replay_new=10, optimizer="adam"),
-    gail=GAILConfig(hidden=(16,), updates=4, minibatch=32),
-    wail=WAILConfig(hidden=(16,), updates=2, minibatch=32),
-    smp=SMPConfig(network="small", iterations=5, batch=8),
-    env=EnvConfig(count=COUNT),
-)
-
-
-def expert_of(windows, horizon=1):
-    """Windows ``[W, D]`` as the demonstration; every coordinate counts once."""
-    windows = jnp.asarray(windows, jnp.float32)
-    size = windows.shape[-1]
-    return Expert(windows, float(size), jnp.full(size, size**-0.5), horizon)
-
-
-def rollout_of(points, valid=None):
-    points = jnp.asarray(points, jnp.float32)
-    valid = jnp.ones((STEPS, COUNT), bool) if valid is None else jnp.asarray(valid)
-    return Rollout(points.reshape(STEPS, COUNT, -1), valid, jnp.zeros((STEPS, COUNT), bool))
+from tests.helpers import COUNT, SMALL, STEPS, expert_of, rollout_of
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,6 @@ with an evaluation, and the best policy's figures where the folder has them.
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -15,8 +14,8 @@ from fmpjax import cli, diagnose
 from fmpjax.config import flatten, preset, to_json
 from fmpjax.diagnose import rules, sentences
 from fmpjax.errors import UserError
+from tests.helpers import ROOT
 
-ROOT = Path(__file__).parents[1]
 RULES = {rule.name: rule for rule in diagnose.RULES}
 
 TRAINING = {
@@ -273,8 +272,8 @@ SYMPTOMS = {
 
 
 @pytest.fixture(scope="module")
-def courses():
-    recorded = json.loads((Path(__file__).parent / "data" / "courses.json").read_text())
+def courses(data):
+    recorded = json.loads((data / "courses.json").read_text())
     made = {}
     for name, kept in recorded.items():
         rows = [dict(zip(kept["columns"], row, strict=True)) for row in kept["rows"]]

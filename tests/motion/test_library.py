@@ -18,7 +18,7 @@ from fmpjax.motion import MotionClip, MotionLibrary, library, load_library
 from fmpjax.motion.clip import refined
 from fmpjax.priors import Expert
 from fmpjax.trainer import Trainer
-from tests.test_train import TINY, settings
+from tests.helpers import TINY, settings
 
 HORIZON = 10
 SHARES = (0.8, 0.2)

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_train import tiny
 
 from fmpjax import cli, potential, priors, runs, transport
 from fmpjax.config import Config, PriorConfig
@@ -18,6 +17,7 @@ from fmpjax.experiments import barycenter, curvature, generalization, report, st
 from fmpjax.experiments.common import histories, offline, reference, results, table
 from fmpjax.priors import flow
 from fmpjax.trainer import Trainer
+from tests.helpers import tiny
 
 SMALL = PriorConfig(bank=16, minibatch=16, hidden=(8,))
 

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_train import tiny
 
 from fmpjax import ppo, runs
 from fmpjax.experiments import standing
 from fmpjax.trainer import Trainer
+from tests.helpers import tiny
 
 STEPS, COUNT = 250, 20
 
