@@ -29,7 +29,7 @@ def train(
 
     Args:
       config: the settings; by default those of ``preset``.
-      command: what the policy is told, "none", "velocity" or "phase"; docs/steering.md.
+      command: what the policy is told, "none", "velocity", "phase" or "motion"; docs/steering.md.
       preset: the name of a preset; by default `laptop` on a CPU and `paper` on an accelerator.
       folder: the run folder; by default ``runs/METHOD-DATE-TIME``.
       minutes: time that the training may take, its compilation and evaluations included.

@@ -57,7 +57,8 @@ class Train:
     motion: Annotated[str | None, _setting("motion")] = None
     """A bundled motion's name, a file or a folder of files; several with weights as NAME[:WEIGHT],NAME[:WEIGHT]."""
     command: Annotated[str | None, default("none, or the run's own with --resume")] = None
-    """What the policy is told: `none`, `velocity` (by default of the motions `gaits`) or `phase`; docs/steering.md."""
+    """What the policy is told: `none`, `velocity` (by default of the motions `gaits`), `phase`,
+    or `motion` (one of several); docs/steering.md."""
     frames: Annotated[str | None, default("all")] = None
     """Source rows first:last of the motion, 0-based, both included; of several motions with commas between them."""
     seed: Annotated[int | None, _setting("seed")] = None

@@ -19,6 +19,7 @@ from fmpjax import kinematics, rotations
 from fmpjax.config import Config, FeatureConfig
 from fmpjax.errors import UserError
 from fmpjax.frames import FORWARD, PLANAR, FrameLayout
+from fmpjax.motion.library import parse
 from fmpjax.robots import Robot
 
 
@@ -95,11 +96,18 @@ def actor_observation(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Arr
 
 def observation_form(config: Config) -> str:
     """What the policy of a configuration observes, in words such as "compact" or "compact heading velocity"."""
-    words = [config.env.observation, config.env.axes, config.command.kind]
+    told = config.command.kind
+    if told == "motion":
+        told += f":{len(parse(config.motion))}"
+    words = [config.env.observation, config.env.axes, told]
     return " ".join(word for word in words if word not in ("world", "none"))
 
 
-COMMAND_TERMS = {"velocity": {"velocity_commands": 3}, "phase": {"clip_phase": 5}}
+def _command_terms(word: str) -> dict[str, int]:
+    """Names and widths of what a policy observes of its command, of that word of an observation's form."""
+    kind, _, motions = word.partition(":")
+    known = {"velocity": {"velocity_commands": 3}, "phase": {"clip_phase": 5}}
+    return {"motion_command": int(motions)} if kind == "motion" else known.get(kind, {})
 
 
 def observation_terms(robot: Robot, form: str) -> dict[str, int]:
@@ -116,7 +124,7 @@ def observation_terms(robot: Robot, form: str) -> dict[str, int]:
     points = {"heading_key_points" if "heading" in more else "key_points": 3 * len(robot.key_body)}
     terms = root | angles | {"joint_velocity": joints} | points
     for word in more:
-        terms |= COMMAND_TERMS.get(word, {})
+        terms |= _command_terms(word)
     return terms
 
 

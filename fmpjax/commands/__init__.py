@@ -1,17 +1,17 @@
-"""What a policy is told while it acts: nothing, a velocity or a time in the clip.
+"""What a policy is told while it acts: nothing, a velocity, a time in the clip or one of several motions.
 
 A command lives in the state of each environment. What a step earns by it joins the prior's reward (`combine`).
 """
 
 import jax
 
-from fmpjax.commands import phase, velocity
+from fmpjax.commands import phase, velocity, which
 from fmpjax.commands.base import Command
 from fmpjax.config import CommandConfig, Config
 from fmpjax.motion import MotionLibrary
 from fmpjax.robots import Robot
 
-__all__ = ["Command", "combine", "make", "phase", "velocity"]
+__all__ = ["Command", "combine", "make", "phase", "velocity", "which"]
 
 
 def make(config: Config, robot: Robot, library: MotionLibrary, frames: jax.Array) -> Command | None:
@@ -31,6 +31,8 @@ def make(config: Config, robot: Robot, library: MotionLibrary, frames: jax.Array
         return velocity.make(config.command, config.control_rate, robot, library)
     if kind == "phase":
         return phase.make(robot, library, frames, config.env.demonstration_parts)
+    if kind == "motion":
+        return which.make(config.command, config.control_rate, robot, library, frames)
     return None
 
 

@@ -118,6 +118,7 @@ COMMANDS: Mapping[str, Mapping[str, Any]] = {
         "features.axes": "heading",
     },
     "phase": {"command.kind": "phase", "env.axes": "heading", "features.axes": "heading"},
+    "motion": {"command.kind": "motion", "env.axes": "heading", "features.axes": "heading"},
 }
 
 

@@ -89,17 +89,17 @@ class EnvConfig(Section):
 class CommandConfig(Section):
     """What the policy is told, and what a step earns by obeying."""
 
-    # nothing [P], a velocity in the heading frame, or the time in the clip ("phase") [D]
-    kind: Literal["none", "velocity", "phase"] = "none"
+    # nothing [P], a velocity in the heading frame, the time in the clip ("phase"), or one of several motions [D]
+    kind: Literal["none", "velocity", "phase", "motion"] = "none"
     combine: Literal["product", "sum"] = "product"  # of the reward of the motion and that of the command [D]
     weight: PositiveFloat = 1.0  # of the command's reward in a sum [D]
-    hold: tuple[float, ...] = (1.0, 3.0)  # s, shortest and longest time for which a velocity is held [D]
+    hold: tuple[float, ...] = (1.0, 3.0)  # s, shortest and longest time for which a velocity or a motion is held [D]
     zero: Annotated[float, Meta(ge=0, le=1)] = 0.1  # share of the new velocities that are zero [D]
     # m/s, slowest and fastest velocity ahead; empty, with the next two, for the demonstrations' own velocities [D]
     ahead: tuple[float, ...] = ()
     sideways: tuple[float, ...] = ()  # m/s, the same to the left; empty for none where another range is given [D]
     turn: tuple[float, ...] = ()  # rad/s, the same of turning to the left [D]
-    average: PositiveFloat = 0.5  # s, time constant of the running mean of the errors [D: half a stride]
+    average: PositiveFloat = 0.5  # s, time constant of the running means of errors and distances [D: half a stride]
     speed_width: PositiveFloat = 0.25  # m/s, error at which the reward of the speed falls to a half [D]
     turn_width: PositiveFloat = 0.25  # rad/s, error at which the reward of the turning falls to a half [D]
     turn_share: Fraction = 0.5  # of the turning in the reward [D]

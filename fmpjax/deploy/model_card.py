@@ -69,6 +69,7 @@ _MEANING = {
     "heading_linear_velocity": "of the root, in those axes, m/s",
     "heading_angular_velocity": "of the root, in those axes, rad/s",
     "heading_key_points": "of {points}: place less the root's, in those axes, m",
+    "motion_command": "1 for the wanted motion, 0 for the others, in the order of the demonstrations",
     "clip_phase": "share of the demonstration that is over, its sine and cosine once and twice per clip",
     "base_ang_vel": "of the root, in its own axes, rad/s",
     "projected_gravity": "where gravity points, a unit vector in the root's axes",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fmpjax import cli, commands, config, features, motion, physics, rotations, runs, steering
-from fmpjax.commands import phase, velocity
+from fmpjax.commands import phase, velocity, which
 from fmpjax.config import CommandConfig, preset
 from fmpjax.env import Env
 from fmpjax.errors import UserError
@@ -103,6 +103,55 @@ def test_the_reward_of_a_velocity_in_closed_form(robot, slow_and_left):
         expected = 0.7 / (1 + (0.2 * share) ** 2 / 0.25) + 0.3 / (1 + (0.2 * share) ** 2 / 0.16)
         np.testing.assert_allclose(reward, [expected], rtol=1e-5)
     np.testing.assert_allclose(state.off, [[0.072, 0.0, 0.072]], atol=1e-6)
+
+
+# --- motions ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_step_earns_by_moving_like_the_motion_that_is_told(robot, slow_and_left):
+    settings = CommandConfig(kind="motion", average=0.02, hold=(1.0, 1.0))
+    clips = slow_and_left.clips
+    frames = [features.observe(robot, jnp.asarray(c.qpos), jnp.asarray(c.qvel), "compact").frame for c in clips]
+    command = which.make(settings, RATE, robot, slow_and_left, jnp.concatenate([*frames, frames[0][:1]]))
+    drawn = command.draw(jax.random.PRNGKey(0), (4,))._replace(
+        clip=jnp.array([1, 1, 1, 1]), left=jnp.array([9, 9, 1, 1])
+    )
+    state = command.begin(jnp.array([0, 250, 10, 400]), drawn)
+    np.testing.assert_array_equal(state.clip, [0, 1, 0, 1])  # the default pose, row 400, begins with a drawn one
+    np.testing.assert_array_equal(command.observe(state), np.eye(2)[[0, 1, 0, 1]])
+    moving = jnp.stack([frames[0][100], frames[0][100], frames[1][100], frames[1][100]])
+    told = command.advance(state, drawn, moving)
+    np.testing.assert_allclose(told.reward, [1, 0, 0, 1], atol=0.01)
+    np.testing.assert_array_equal(told.state.clip, [0, 1, 1, 1])  # held, held, over, over
+    assert not told.over.any()
+    np.testing.assert_array_equal(command.advance(state, None, moving).state.clip, state.clip)
+    # Halfway between the two: a mean of both distances.
+    between = command.advance(state, drawn, 0.5 * (moving[:1] + moving[2:3]).repeat(4, 0)).reward
+    np.testing.assert_allclose(between, 0.5, atol=0.02)
+
+
+def test_a_posture_is_the_same_wherever_it_faces(robot, slow_and_left):
+    clip, angle = slow_and_left.clips[1], 1.2
+    qpos, qvel = clip.qpos[50].copy(), clip.qvel[50].copy()
+    turned, spun = qpos.copy(), qvel.copy()
+    cosine, sine = np.cos(angle), np.sin(angle)
+    turned[:3] = [cosine * qpos[0] - sine * qpos[1] + 3, sine * qpos[0] + cosine * qpos[1] - 1, qpos[2]]
+    turned[3:7] = rotations.multiply(np.array([np.cos(angle / 2), 0, 0, np.sin(angle / 2)]), qpos[3:7])
+    spun[:2] = [cosine * qvel[0] - sine * qvel[1], sine * qvel[0] + cosine * qvel[1]]
+    frames = features.observe(robot, jnp.stack([qpos, turned]), jnp.stack([qvel, spun]), "compact").frame
+    here, there = which.posture(frames, FrameLayout.of(robot))
+    np.testing.assert_allclose(here, there, atol=2e-6)
+
+
+def test_one_motion_is_none_to_choose_from(robot, walk):
+    with pytest.raises(UserError, match=r"command\.kind is 'motion' and the run has one motion: expected two or more"):
+        which.make(CommandConfig(kind="motion"), RATE, robot, MotionLibrary((walk,), (1.0,)), jnp.zeros((1, 1)))
+
+
+def test_the_form_of_an_observation_counts_the_motions(robot):
+    form = features.observation_form(preset("smoke", **{"command.kind": "motion", "motion": "walk,turn_left:2"}))
+    assert form == "compact motion:2"
+    assert features.observation_terms(robot, form)["motion_command"] == 2
 
 
 # --- phases ----------------------------------------------------------------------------------------------------------
