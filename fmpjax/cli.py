@@ -153,7 +153,7 @@ class ShowConfig:
     """Print every setting of a preset."""
 
     preset: tyro.conf.Positional[str] = "laptop"
-    """`smoke`, `laptop` or `paper`."""
+    """`smoke`, `laptop`, `robust`, `robot` or `paper`."""
 
     def __call__(self) -> None:
         for key, value in configuration.flatten(configuration.preset(self.preset)).items():
