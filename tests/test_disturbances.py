@@ -210,7 +210,7 @@ def test_a_deployable_observation_is_what_a_robot_senses(robot, walk):
     assert list(terms) == [
         "base_ang_vel", "projected_gravity", "velocity_commands", "joint_pos_rel", "joint_vel_rel", "last_action",
     ]  # fmt: skip
-    assert seen.shape == (COUNT, sum(terms.values())) == (COUNT, 99)
+    assert seen.shape == (COUNT, sum(terms.values())) == (COUNT, 96)
     parts = dict(zip(terms, np.split(np.asarray(seen), np.cumsum(list(terms.values()))[:-1], axis=1), strict=True))
     np.testing.assert_allclose(parts["base_ang_vel"], sim.qvel[:, 3:6])
     np.testing.assert_allclose(
@@ -314,7 +314,7 @@ def test_the_actor_sees_sensors_and_the_critic_the_truth(played):
     env, (start, *_), (first, second), _ = played
     assert isinstance(first.observation, Seen)
     sizes = env.observation_size
-    assert sizes.actor == first.observation.actor.shape[-1] == 2 * 99
+    assert sizes.actor == first.observation.actor.shape[-1] == 2 * 96
     # Compact observation, command, its errors, two actions on their way, their delay, robot and floor.
     assert sizes.critic == first.observation.critic.shape[-1] == 86 + 3 + 3 + 2 * 29 + 1 + 7
     assert first.next_observation.shape[-1] == sizes.critic
