@@ -10,6 +10,23 @@ def _keep(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     return key
 
 
+class Seen(NamedTuple):
+    """What the networks observe where the critic sees more than the actor; elsewhere one array stands for both."""
+
+    actor: Any  # [..., O]
+    critic: Any  # [..., C]
+
+
+def of_actor(seen: Any) -> Any:
+    """The actor's part of what is observed, or of what is kept for both networks."""
+    return seen.actor if isinstance(seen, Seen) else seen
+
+
+def of_critic(seen: Any) -> Any:
+    """The critic's part."""
+    return seen.critic if isinstance(seen, Seen) else seen
+
+
 class Policy(NamedTuple):
     """A stochastic policy, its random numbers apart, so that a rollout draws those of all its steps at once.
 

@@ -30,10 +30,16 @@ class Evaluate:
     """Take the newest checkpoint in place of the best."""
     commands: bool = False
     """Measure how well a policy that is told velocities obeys them; docs/steering.md."""
+    robust: bool = False
+    """Measure how well any policy stays up under pushes, delays and other disturbances; docs/robustness.md."""
 
     def __call__(self) -> None:
+        if self.commands and self.robust:
+            raise UserError("--commands and --robust are two evaluations: expected one of them")
         if self.commands:
             return self._commands()
+        if self.robust:
+            return self._robust()
         runs = runs_module()
         from fmpjax.evaluate import Evaluator, table
 
@@ -64,6 +70,25 @@ class Evaluate:
         path = run.folder / ("steering-last.json" if self.last else "steering.json")
         write(path, found.to_json())
         print(f"wrote {path}\nwrote {heat.draw(path.with_suffix('.png'), *steering.maps(found))}")
+
+    def _robust(self) -> None:
+        runs = runs_module()
+        from fmpjax import robustness
+        from fmpjax.files import write
+        from fmpjax.viz import bars
+
+        if self.episodes is not None and self.episodes < 1:
+            raise UserError(f"--episodes is {self.episodes}: expected at least 1")
+        run = runs.Run.open(self.run)
+        trainer, state = run.policy(best=not self.last)
+        episodes = self.episodes or robustness.EPISODES
+        print(f"compiling the episodes, {episodes} of each case; each case takes seconds ...", flush=True)
+        print(f"iteration {int(state.iteration):,}:\n{robustness.heading()}")
+        found = robustness.measure(trainer, state.ppo, episodes=episodes, note=lambda line: print(line, flush=True))
+        path = run.folder / ("robustness-last.json" if self.last else "robustness.json")
+        write(path, found.to_json())
+        title = f"{run.folder.resolve().name}: first episodes of {found.seconds:g} s, {episodes} per bar"
+        print(f"wrote {path}\nwrote {bars.draw(path.with_suffix('.png'), robustness.bars(found), title)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,7 +178,7 @@ class ShowConfig:
     """Print every setting of a preset."""
 
     preset: tyro.conf.Positional[str] = "laptop"
-    """`smoke`, `laptop` or `paper`."""
+    """`smoke`, `laptop`, `robust`, `robot` or `paper`."""
 
     def __call__(self) -> None:
         for key, value in configuration.flatten(configuration.preset(self.preset)).items():

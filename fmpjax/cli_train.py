@@ -51,7 +51,7 @@ class Train:
     reset: Annotated[str | None, _setting("env.reset")] = None
     """`dataset` (a demonstration state) or `fixed` (the default pose)."""
     preset: Annotated[str | None, default("laptop on a CPU, paper on an accelerator")] = None
-    """`smoke`, `laptop` or `paper`."""
+    """`smoke`, `laptop`, `robust`, `robot` or `paper`; `fmpjax list` says what each is for."""
     robot: Annotated[str | None, _setting("robot")] = None
     """A robot under robots/."""
     motion: Annotated[str | None, _setting("motion")] = None
@@ -177,8 +177,10 @@ class Train:
     def _created(self, devices: int | None):
         runs = runs_module()
         from fmpjax import sharding
+        from fmpjax.motion import library
 
         config = configuration.preset(self.preset or runs.default_preset(), **self._changes())
+        config = configuration.with_changes(config, {"motion": library.listed(config.motion)})
         runs.check_trainable(config, self.seeds or 1)
         if devices != 1:
             sharding.check_divides(config.env.count, self.seeds or 1, sharding.mesh(devices).size)
@@ -200,8 +202,6 @@ class Train:
             "seed": self.seed,
             "transitions": self.transitions,
         }
-        from fmpjax.motion import library
-
         changes: dict[str, object] = {key: value for key, value in named.items() if value is not None}
         for item in self.set:
             key, equals, value = item.partition("=")
@@ -210,7 +210,4 @@ class Train:
             changes[key] = value
         if self.resume:
             return changes | ({} if self.command is None else {"command.kind": self.command})
-        changes = configuration.commanded(self.command, changes)
-        if isinstance(names := changes.get("motion"), str):
-            changes["motion"] = library.listed(names)
-        return changes
+        return configuration.commanded(self.command, changes)

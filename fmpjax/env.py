@@ -13,28 +13,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import commands, features, physics, sharding
-from fmpjax.acting import Policy
-from fmpjax.config import Config
+from fmpjax import commands, disturbances, features, offenders, physics, sharding
+from fmpjax.acting import Policy, Seen, of_actor
+from fmpjax.actions import ActionMap, action_map
+from fmpjax.config import Config, DisturbanceConfig
 from fmpjax.features import Observed
 from fmpjax.motion import MotionClip, MotionLibrary
 from fmpjax.motion.clip import refined
+from fmpjax.offenders import Offender
 from fmpjax.robots import Robot
 
-# What a state must stay below. No joint or fall of a robot of this size is as fast: such a state has blown up.
-_LIMITS = physics.PhysicsState(qpos=np.inf, qvel=1e3, warmstart=np.inf)  # m and rad, m/s and rad/s, m/s² and rad/s²
-
-
 # Fields of `EnvState` with a leading axis of environments.
-PER_ENVIRONMENT = ("physics", "observed", "history", "age", "command")
+PER_ENVIRONMENT = ("physics", "observed", "history", "age", "command", "disturbed")
 
-
-class Offender(NamedTuple):
-    """The last state from which the physics left the finite numbers, kept to be looked at."""
-
-    qpos: jax.Array  # [7 + J]
-    qvel: jax.Array  # [6 + J]
-    action: jax.Array  # [J] normalised
+__all__ = ["ActionMap", "Drawn", "Env", "EnvState", "Moment", "Steps", "action_map"]
 
 
 class EnvState(NamedTuple):
@@ -49,6 +41,7 @@ class EnvState(NamedTuple):
     cap_age: jax.Array  # scalar int32, rollouts since the cap last grew
     offender: Offender
     command: Any = ()  # each environment's, as its kind has it; nothing without commands
+    disturbed: Any = ()  # each environment's `disturbances.State`; nothing without disturbances
 
 
 class Moment(NamedTuple):
@@ -60,6 +53,7 @@ class Moment(NamedTuple):
     window: jax.Array  # [N, H] int32, frame table's rows of the frames up to the present one, oldest first
     offender: Offender  # each environment's own in this rollout, [N, ...]
     command: Any = ()  # each environment's
+    disturbed: Any = ()  # each environment's
 
 
 class Drawn(NamedTuple):
@@ -70,6 +64,7 @@ class Drawn(NamedTuple):
     window: jax.Array  # [N, H] int32, frame table's rows of the histories up to there
     key: jax.Array  # of the noise on those states
     command: Any = ()  # random numbers of the commands
+    disturbed: Any = ()  # random numbers of the disturbances
 
 
 class Reached(NamedTuple):
@@ -79,13 +74,14 @@ class Reached(NamedTuple):
     observed: Observed
     fell: jax.Array  # [N] bool, or not finite
     finite: jax.Array  # [N] bool
+    disturbed: Any = ()  # the disturbances after the step
 
 
 class Steps(NamedTuple):
     """A rollout: T steps of N environments."""
 
-    observation: jax.Array  # [T, N, O] before the action
-    next_observation: jax.Array  # [T, N, O] after it, before any reset: the true one
+    observation: Any  # [T, N, O] before the action; `Seen` with disturbances
+    next_observation: jax.Array  # [T, N, O] after it, before any reset: the true one, with disturbances the critic's
     action: jax.Array  # [T, N, J] normalised
     extras: dict[str, jax.Array]  # what the policy said of the action, each [T, N, ...]
     fell: jax.Array  # [T, N] bool
@@ -97,32 +93,6 @@ class Steps(NamedTuple):
     obeyed: Any = ()  # [T, N] in [0, 1], what obeying the command earned; nothing without commands
 
 
-class ActionMap(NamedTuple):
-    """Joint targets (rad) from normalised actions: clip(center + scale * a, low, high); each ``[J]``."""
-
-    center: np.ndarray
-    scale: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-    def __call__(self, action: jax.Array) -> jax.Array:
-        return jnp.clip(self.center + self.scale * action, self.low, self.high).astype(action.dtype)
-
-
-def action_map(robot: Robot, motion: MotionClip | MotionLibrary, kind: str) -> ActionMap:
-    """The ``absolute`` map around zero, or the ``residual`` map around the demonstrations' mean pose."""
-    if kind == "absolute":
-        scale = 1.4 * np.maximum(np.abs(robot.joint_low), np.abs(robot.joint_high))
-        return ActionMap(np.zeros_like(scale), scale, -scale, scale)
-    library = MotionLibrary.of(motion)
-    return ActionMap(
-        center=library.mean([clip.qpos[:, 7:].mean(0) for clip in library.clips]),
-        scale=0.25 * robot.effort / robot.stiffness,
-        low=robot.joint_low - 0.3,
-        high=robot.joint_high + 0.3,
-    )
-
-
 class Env:
     """Environments of one robot and its demonstrations; its methods are pure."""
 
@@ -131,8 +101,8 @@ class Env:
         self.horizon = config.features.history
         library = MotionLibrary.of(motion)
         self.actions = action_map(robot, library, config.env.action)
-        self.form = features.observation_form(config)
-        observe = jax.jit(lambda qpos, qvel: features.observe(robot, qpos, qvel, self.form))
+        self.form, true_form = features.observation_form(config), features.true_form(config)
+        observe = jax.jit(lambda qpos, qvel: features.observe(robot, qpos, qvel, true_form))
         self._observe = observe
         # A row stands `stride` rows after the frame before it.
         self.stride = config.env.demonstration_parts
@@ -147,20 +117,44 @@ class Env:
         self._table = jax.tree.map(np.asarray, observe(jnp.asarray(self._qpos), jnp.asarray(self._qvel)))
         self.clip_rows = len(library.qpos)
         self.command = commands.make(config, robot, library, self._table.frame)
+        told = self.command.size if self.command else 0
+        self.disturbances = disturbances.make(config, robot, self.actions, told)
 
     @property
-    def observation_size(self) -> int:
-        return self._table.actor.shape[-1] + (self.command.size if self.command else 0)
+    def observation_size(self) -> Any:
+        """Numbers that the networks observe; `Seen` where the critic sees more than the actor."""
+        return jax.tree.map(lambda x: x.shape[-1], jax.eval_shape(lambda: self.clip_observations))
 
     @property
-    def clip_observations(self) -> jax.Array:
-        """Policy observations of the demonstrations, ``[M, O]``."""
+    def clip_observations(self) -> Any:
+        """What the networks observe of the demonstrations, ``[M, O]``."""
         rows = jnp.arange(self.clip_rows)
-        return self.seen(jnp.asarray(self._table.actor)[rows], self.first_command(rows))
+        if not self.disturbances:
+            return self.seen(jnp.asarray(self._table.actor)[rows], self.first_command(rows))
+        begun, key = self.start_at(rows), jax.random.PRNGKey(0)
+        disturbed = self.disturbances.standing(begun.disturbed, begun.physics.qpos)
+        return self.look(begun._replace(disturbed=disturbed), self.disturbances.draw(key, (len(rows),)))[1]
+
+    def look(self, now: Any, drawn: jax.Array) -> tuple[Any, Any]:
+        """The environments, an `EnvState` or a `Moment`, after their sensors were read, and what the networks observe.
+
+        ``drawn`` are random numbers of the disturbances, and nothing without those.
+        """
+        if not self.disturbances:
+            return now, self.seen(now.observed.actor, now.command)
+        told = self.command.observe(now.command) if self.command else ()
+        actor, disturbed = self.disturbances.sense(now.disturbed, now.physics, told, drawn)
+        critic = self._revealed(now.observed.actor, now.command, disturbed)
+        return now._replace(disturbed=disturbed), Seen(actor, critic)
 
     def seen(self, actor: jax.Array, command: Any) -> jax.Array:
-        """What the networks observe, ``[..., O]``: the robot, and the command where there is one."""
+        """What the networks observe without disturbances, ``[..., O]``: the robot, and the command if there is one."""
         return jnp.concatenate([actor, self.command.observe(command)], axis=-1) if self.command else actor
+
+    def _revealed(self, actor: jax.Array, command: Any, disturbed: disturbances.State) -> jax.Array:
+        """What a critic sees with disturbances, ``[N, C]``: all that is true."""
+        more = [self.command.reveal(command)] if self.command and self.command.reveal else []
+        return jnp.concatenate([self.seen(actor, command), *more, self.disturbances.reveal(disturbed)], axis=-1)
 
     def first_command(self, rows: jax.Array, key: jax.Array | None = None) -> Any:
         """Commands of episodes that begin at the table rows ``[N]``."""
@@ -232,7 +226,18 @@ class Env:
                 *(jnp.zeros(n) for n in (state.qpos.shape[-1], state.qvel.shape[-1], len(self.actions.low)))
             ),
             command=self.first_command(rows, None if key is None else jax.random.fold_in(key, 3)),
+            disturbed=self._first_disturbances(jax.random.PRNGKey(0) if key is None else key, len(rows)),
         )
+
+    def _first_disturbances(self, key: jax.Array, count: int) -> Any:
+        return self.disturbances.init(jax.random.fold_in(key, 4), count) if self.disturbances else ()
+
+    def undisturbed(self, state: EnvState) -> EnvState:
+        """Environments whose episodes begin, with the disturbances that there may be at zero."""
+        if not self.disturbances:
+            return state
+        calm = self.disturbances.init(jax.random.PRNGKey(0), len(state.age), DisturbanceConfig())
+        return state._replace(disturbed=calm)
 
     def reset(self, key: jax.Array) -> EnvState:
         """All environments at fresh resets."""
@@ -246,9 +251,10 @@ class Env:
 
         def play(now: Moment, inputs) -> tuple[Moment, Steps]:
             noise, drawn = inputs
-            action, extras = policy.act(self.seen(now.observed.actor, now.command), noise)
+            now, seen = self.look(now, drawn.disturbed)
+            action, extras = policy.act(of_actor(seen), noise)
             now, record = self.step(now, action, drawn, state.cap)
-            return now, record._replace(extras=extras)
+            return now, record._replace(observation=seen, extras=extras)
 
         # Once for all steps: inside the loop, random numbers were most of what a small step launches.
         policy_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(key, steps))
@@ -260,10 +266,11 @@ class Env:
             window=jax.vmap(self.history_rows)(starts),
             key=jax.vmap(lambda key: jax.random.fold_in(key, 2))(reset_keys),
             command=self._command_draws(reset_keys, count),
+            disturbed=self.disturbance_draws(key, steps, count),
         )
         window = before + jnp.arange(count * self.horizon).reshape(count, self.horizon)
         offender = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), state.offender)
-        now = Moment(state.physics, state.observed, state.age, window, offender, state.command)
+        now = Moment(state.physics, state.observed, state.age, window, offender, state.command, state.disturbed)
         now, record = jax.lax.scan(play, now, (noise, drawn))
         new_state = state._replace(
             physics=now.physics,
@@ -271,7 +278,8 @@ class Env:
             history=self.frame_table(state, record)[now.window],
             age=now.age,
             command=now.command,
-            offender=_last_offender(now.offender, record.nonfinite, state.offender),
+            disturbed=now.disturbed,
+            offender=offenders.last_offender(now.offender, record.nonfinite, state.offender),
         )
         return self._grow_cap(new_state, record), record
 
@@ -286,8 +294,9 @@ class Env:
 
         Returns:
           The environments before the next step, and the record of this one, each field ``[N, ...]``, with no extras.
+          Its observation is that of a robot without disturbances.
         """
-        reached = self.advance(now.physics, action)
+        reached = self.advance(now.physics, action, now.disturbed, drawn.disturbed)
         age = now.age + 1
         timed_out = (age >= cap) & ~reached.fell
         command, obeyed = (), ()
@@ -295,9 +304,12 @@ class Env:
             command, over, obeyed = self.command.advance(now.command, drawn.command, reached.observed.frame)
             timed_out |= over & ~reached.fell
         window = sharding.split(jnp.concatenate([now.window[:, 1:], drawn.row[:, None]], axis=1))
+        following = self.seen(reached.observed.actor, command)
+        if self.disturbances:
+            following = self._revealed(reached.observed.actor, command, reached.disturbed)
         record = Steps(
             observation=self.seen(now.observed.actor, now.command),
-            next_observation=self.seen(reached.observed.actor, command),
+            next_observation=following,
             action=action,
             extras={},
             fell=reached.fell,
@@ -314,7 +326,21 @@ class Env:
         begun = sim, observed, jnp.zeros_like(age), drawn.window, fresh
         after = reached.physics, reached.observed, age, window, command
         *kept, command = jax.tree.map(lambda new, old: jnp.where(_over(done, old), new, old), begun, after)
-        return Moment(*kept, offender=_offender(now, action, reached.finite), command=command), record
+        disturbed = self._again(reached.disturbed, done, drawn.disturbed)
+        offender = offenders.offender(now.physics, action, reached.finite, now.offender)
+        return Moment(*kept, offender=offender, command=command, disturbed=disturbed), record
+
+    def _again(self, disturbed: Any, done: jax.Array, drawn: Any) -> Any:
+        """The disturbances, those of an episode begun again where one is ``done [N]``."""
+        if not self.disturbances:
+            return disturbed
+        fresh = self.disturbances.begin(disturbed.sizes, drawn)
+        episode = jax.tree.map(lambda new, old: jnp.where(_over(done, old), new, old), fresh, disturbed.episode)
+        return disturbed._replace(episode=episode)
+
+    def disturbance_draws(self, key: jax.Array, steps: int, count: int) -> Any:
+        """Random numbers of the disturbances of ``count`` environments in ``steps`` steps; nothing without those."""
+        return self.disturbances.draw(jax.random.fold_in(key, 4), (steps, count)) if self.disturbances else ()
 
     def _command_draws(self, keys: jax.Array, count: int) -> Any:
         """Random numbers of the commands of all steps, which have a key each."""
@@ -322,14 +348,20 @@ class Env:
             return ()
         return jax.vmap(lambda key: self.command.draw(jax.random.fold_in(key, 3), (count,)))(keys)
 
-    def advance(self, sim: physics.PhysicsState, action: jax.Array) -> Reached:
-        """The physics of one control step under normalised actions ``[N, J]``, whatever the episodes."""
-        reached = sharding.per_device(self.physics.step)(sim, self.actions(action))
-        finite = _finite(reached)
+    def advance(self, sim: physics.PhysicsState, action: jax.Array, disturbed: Any = (), drawn: Any = ()) -> Reached:
+        """The physics of one control step under normalised actions ``[N, J]``, whatever the episodes.
+
+        With disturbances it takes their state and random numbers, too.
+        """
+        arguments: tuple[Any, ...] = sim, self.actions(action)
+        if self.disturbances:
+            arguments, disturbed = self.disturbances.act(disturbed, sim, action, drawn)
+        reached = sharding.per_device(self.physics.step)(*arguments)
+        finite = offenders.finite(reached)
         # Non-finite numbers must not reach the observation, not even to be discarded: the state before stays.
         sim = jax.tree.map(lambda new, old: jnp.where(finite[:, None], new, old), reached, sim)
         observed = self._observe(sim.qpos, sim.qvel)
-        return Reached(sim, observed, observed.fallen | ~finite, finite)
+        return Reached(sim, observed, observed.fallen | ~finite, finite, disturbed)
 
     def frame_table(self, state: EnvState, record: Steps) -> jax.Array:
         """Frames ``[rows, F]`` that the windows of a rollout begun in ``state`` index."""
@@ -348,30 +380,12 @@ class Env:
         last = min(config.last_cap, config.episode_steps)
         grow = (share > config.cap_share) & (cap_age >= config.cap_patience) & (state.cap < last)
         cap = jnp.where(grow, jnp.minimum(jnp.ceil(state.cap * config.cap_growth), last), state.cap)
-        return state._replace(cap=cap, capped_share=share, cap_age=jnp.where(grow, 0, cap_age))
+        state = state._replace(cap=cap, capped_share=share, cap_age=jnp.where(grow, 0, cap_age))
+        if not self.disturbances:
+            return state
+        return state._replace(disturbed=self.disturbances.grow(state.disturbed, share, config.cap_share))
 
 
 def _over(chosen: jax.Array, values: jax.Array) -> jax.Array:
     """``chosen [N]`` with as many axes as ``values [N, ...]``."""
     return chosen.reshape(-1, *[1] * (values.ndim - 1))
-
-
-def _offender(now: Moment, action: jax.Array, finite: jax.Array) -> Offender:
-    """Each environment's last offender after a step that left ``finite [N]`` of them finite."""
-    # Each keeps its own, which needs no word from the others while the rollout goes on.
-    here = Offender(now.physics.qpos, now.physics.qvel, action)
-    return jax.tree.map(lambda new, old: jnp.where(finite[:, None], old, new), here, now.offender)
-
-
-def _last_offender(offenders: Offender, nonfinite: jax.Array, before: Offender) -> Offender:
-    """The newest of the offenders ``[N, ...]`` of a rollout, the first of those of one step; else the one before."""
-    when = jnp.where(nonfinite, jnp.arange(1, len(nonfinite) + 1)[:, None], 0).max(0)
-    last = jnp.argmax(when)
-    return jax.tree.map(lambda new, old: jnp.where(when.any(), new[last], old), offenders, before)
-
-
-def _finite(sim: physics.PhysicsState) -> jax.Array:
-    """Whether each environment's state is finite and has not blown up, ``[N]`` bool."""
-    # One comparison for all columns. It is false for NaN, and for infinity where the limit is infinity.
-    limit = np.concatenate([np.full(x.shape[-1], most, np.float32) for x, most in zip(sim, _LIMITS, strict=True)])
-    return (jnp.abs(jnp.concatenate(sim, axis=-1)) < limit).all(-1)

@@ -12,6 +12,7 @@ from ott.geometry import geometry
 from ott.tools import sinkhorn_divergence
 
 from fmpjax import features, jsons, kinematics, metrics, rotations, tables, transport
+from fmpjax.acting import of_actor
 from fmpjax.config import Config, FeatureConfig
 from fmpjax.env import EnvState
 from fmpjax.motion import MotionClip
@@ -177,33 +178,35 @@ class Evaluator:
         env, headline, start = self.trainer.env, self.count, self.start()
         policy = self.trainer.ppo.act(state, deterministic=True)
 
-        def step(carry, _):
-            sim, observed, command, alive, fell, length = carry
+        def step(carry, drawn):
+            now, alive, fell, length = carry
+            now, seen = env.look(now, drawn)
             with self.trainer.precision():
-                action, _ = policy(env.seen(observed.actor, command), None)
-            reached = env.advance(sim, action)
+                action, _ = policy.act(of_actor(seen), None)
+            reached = env.advance(now.physics, action, now.disturbed, drawn)
             fell, length = fell | (alive & reached.fell), length + alive
             still_alive = alive & ~reached.fell
+            now = now._replace(disturbed=reached.disturbed)
             if env.command:  # it stays what it was at the start, and may end the episode
-                command, over, _ = env.command.advance(command, None, reached.observed.frame)
-                still_alive &= ~over
+                command, over, _ = env.command.advance(now.command, None, reached.observed.frame)
+                now, still_alive = now._replace(command=command), still_alive & ~over
 
             def hold(new, old):
                 # The step on which a robot falls is part of its episode; after it nothing moves.
                 return jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-            sim = jax.tree.map(hold, reached.physics, sim)
-            observed = jax.tree.map(hold, reached.observed, observed)
-            return (sim, observed, command, still_alive, fell, length), (sim.qpos[:headline], sim.qvel[:headline])
+            sim = jax.tree.map(hold, reached.physics, now.physics)
+            observed = jax.tree.map(hold, reached.observed, now.observed)
+            now = now._replace(physics=sim, observed=observed)
+            return (now, still_alive, fell, length), (sim.qpos[:headline], sim.qvel[:headline])
 
         alive = jnp.ones(len(self.rows), bool)
-        carry, (qpos, qvel) = jax.lax.scan(
+        (_, _, fell, length), (qpos, qvel) = jax.lax.scan(
             step,
-            (start.physics, start.observed, start.command, alive, ~alive, jnp.zeros(len(self.rows), jnp.int32)),
-            None,
+            (start, alive, ~alive, jnp.zeros(len(self.rows), jnp.int32)),
+            env.disturbance_draws(jnp.asarray(self._key), env.config.episode_steps, len(self.rows)),
             length=env.config.episode_steps,
         )
-        *_, fell, length = carry
         return qpos, qvel, length, fell, start.physics.qpos, start.history
 
     def play(self, state: PPOState) -> Episodes:

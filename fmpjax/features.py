@@ -94,24 +94,42 @@ def actor_observation(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Arr
     return _observation(robot, _parts(robot, qpos, qvel), "full")
 
 
-def observation_form(config: Config) -> str:
-    """What the policy of a configuration observes, in words such as "compact" or "compact heading velocity"."""
+def observation_form(config: Config, *, history: bool = True) -> str:
+    """What the policy of a configuration observes, in words such as "compact heading velocity" or "deployable".
+
+    With ``history`` the form of a policy that sees earlier steps, too, ends with a word such as "history-5".
+    """
+    steps = config.env.observation_history if history else 1
+    axes = "world" if config.env.observation == "deployable" else config.env.axes
     told = config.command.kind
     if told == "motion":
-        told += f":{len(parse(config.motion))}"
-    words = [config.env.observation, config.env.axes, told]
-    return " ".join(word for word in words if word not in ("world", "none"))
+        told += f"-{len(parse(config.motion))}"
+    words = [config.env.observation, axes, told, f"history-{steps}"]
+    return " ".join(word for word in words if word not in ("world", "none", "history-1"))
+
+
+def true_form(config: Config) -> str:
+    """What `observe` gives: what the policy of a configuration observes, or the critic of one that is deployable."""
+    content = "compact" if config.env.observation == "deployable" else config.env.observation
+    return content if config.env.axes == "world" else f"{content} {config.env.axes}"
 
 
 def _command_terms(word: str) -> dict[str, int]:
     """Names and widths of what a policy observes of its command, of that word of an observation's form."""
-    kind, _, motions = word.partition(":")
+    kind, _, motions = word.partition("-")
     known = {"velocity": {"velocity_commands": 3}, "phase": {"clip_phase": 5}}
     return {"motion_command": int(motions)} if kind == "motion" else known.get(kind, {})
 
 
+def observation_history(form: str) -> int:
+    """Control steps that an observation of a form, as `observation_form` gives it, is of."""
+    return next((int(word.removeprefix("history-")) for word in form.split() if word.startswith("history-")), 1)
+
+
 def observation_terms(robot: Robot, form: str) -> dict[str, int]:
     """Names and widths of the parts of the policy's observation, in their order.
+
+    A part with a history holds its steps one after another, the oldest first.
 
     Args:
       robot: that is observed.
@@ -119,13 +137,20 @@ def observation_terms(robot: Robot, form: str) -> dict[str, int]:
     """
     content, *more = form.split()
     joints, axes = robot.joint_count, "heading" if "heading" in more else "root"
+    told = {name: width for word in more for name, width in _command_terms(word).items()}
+    if content == "deployable":
+        terms = {"base_ang_vel": 3, "projected_gravity": 3} | told
+        terms |= {"joint_pos_rel": joints, "joint_vel_rel": joints, "last_action": joints}
+        return {name: observation_history(form) * width for name, width in terms.items()}
     angles = {"joint_rotation_6d": 6 * _rotations(robot)} if content == "full" else {"joint_position": joints}
     root = {"root_height": 1, f"{axes}_rotation_6d": 6, f"{axes}_linear_velocity": 3, f"{axes}_angular_velocity": 3}
     points = {"heading_key_points" if "heading" in more else "key_points": 3 * len(robot.key_body)}
-    terms = root | angles | {"joint_velocity": joints} | points
-    for word in more:
-        terms |= _command_terms(word)
-    return terms
+    return root | angles | {"joint_velocity": joints} | points | told
+
+
+def observation(robot: Robot, qpos: jax.Array, qvel: jax.Array, form: str) -> jax.Array:
+    """The observation ``[..., O]`` of states, in a form that is not deployable, without the command."""
+    return _observation(robot, _parts(robot, qpos, qvel), form)
 
 
 def _observation(robot: Robot, p: _Parts, form: str) -> jax.Array:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from fmpjax.acting import of_actor
 from fmpjax.errors import UserError
 
 if TYPE_CHECKING:
@@ -72,8 +73,8 @@ def of(trainer: "Trainer", state: "PPOState") -> Policy:
         activation=config.ppo.activation,
         kernels=kernels,
         biases=biases,
-        mean=np.asarray(state.normalizer.mean),
-        deviation=np.asarray(state.normalizer.std),
+        mean=np.asarray(of_actor(state.normalizer.mean)),
+        deviation=np.asarray(of_actor(state.normalizer.std)),
         clip=float(config.ppo.normalizer_clip),
         **{name: np.asarray(value, np.float32) for name, value in actions._asdict().items()},
     )

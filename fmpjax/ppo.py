@@ -14,7 +14,7 @@ import optax
 from flax import linen
 
 from fmpjax import learning, machine, sharding
-from fmpjax.acting import Policy
+from fmpjax.acting import Policy, Seen, of_actor, of_critic
 from fmpjax.config import PPOConfig
 
 machine.import_mjx()  # which Brax imports
@@ -33,15 +33,15 @@ class PPOState(NamedTuple):
     critic: Any
     actor_optimizer: optax.OptState
     critic_optimizer: optax.OptState
-    normalizer: RunningStatisticsState  # of the observations
+    normalizer: RunningStatisticsState  # of the observations, `Seen` where the critic sees more
     rate: jax.Array  # scalar, learning rate of both
 
 
 class Batch(NamedTuple):
     """A rollout as PPO sees it, ``[T, N, ...]``."""
 
-    observation: jax.Array
-    next_observation: jax.Array
+    observation: Any  # an array, or `Seen` where the critic sees more than the actor
+    next_observation: Any  # likewise, of which only the critic's part is read
     action: jax.Array
     mean: jax.Array  # of the policy that acted
     deviation: jax.Array
@@ -81,11 +81,14 @@ class PPO:
     """Pure functions of the networks that a configuration describes.
 
     Args:
+      observation_size: numbers of an observation; `Seen` of two where the critic sees more than the actor.
+      action_size: J.
+      config: of the networks and their updates.
       clock: steps of the longest episode, where the critic also observes the share of them that is over. A reward that
         depends on an episode's past needs it. 0 for a critic that observes what the policy does.
     """
 
-    def __init__(self, observation_size: int, action_size: int, config: PPOConfig, clock: int = 0):
+    def __init__(self, observation_size: int | Seen, action_size: int, config: PPOConfig, clock: int = 0):
         self.config, self.clock = config, clock
         self.observation_size, self.action_size = observation_size, action_size
         activation, initializers = learning.activation(config.activation), jax.nn.initializers
@@ -98,30 +101,33 @@ class PPO:
         clip = [optax.clip_by_global_norm(config.clip_norm)] if config.clip_norm else []
         self._optimizer = optax.chain(*clip, learning.direction(config.optimizer, config.momentum))
 
-    def init(self, key: jax.Array, observations: jax.Array | None = None) -> PPOState:
+    def init(self, key: jax.Array, observations: Any = None) -> PPOState:
         """Initial state; ``observations [M, O]`` start the running statistics where the configuration asks for it."""
         actor_key, critic_key = jax.random.split(key)
-        actor = self._actor.init(actor_key, jnp.zeros((1, self.observation_size)))
-        critic = self._critic.init(critic_key, jnp.zeros((1, self.observation_size + bool(self.clock))))
-        normalizer = running_statistics.init_state(jnp.zeros(self.observation_size))
+        size = self.observation_size
+        actor = self._actor.init(actor_key, jnp.zeros((1, of_actor(size))))
+        critic = self._critic.init(critic_key, jnp.zeros((1, of_critic(size) + bool(self.clock))))
+        normalizer = running_statistics.init_state(jax.tree.map(jnp.zeros, size))
         if self.config.normalizer_from_clip and observations is not None:
-            normalizer = self.observe(normalizer, jnp.asarray(observations))
+            normalizer = self.observe(normalizer, jax.tree.map(jnp.asarray, observations))
         optimizer = self._optimizer
         rate = jnp.float32(self.config.learning_rate)
         return PPOState(actor, critic, optimizer.init(actor), optimizer.init(critic), normalizer, rate)
 
-    def observe(self, normalizer: RunningStatisticsState, observations: jax.Array) -> RunningStatisticsState:
+    def observe(self, normalizer: RunningStatisticsState, observations: Any) -> RunningStatisticsState:
         """Running statistics after ``observations [..., O]``."""
-        flat = observations.reshape(-1, observations.shape[-1])
+        flat = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), observations)
         normalizer = running_statistics.update(normalizer, flat, std_min_value=self.config.normalizer_floor)
         return capped(normalizer, self.config.normalizer_count) if self.config.normalizer_count else normalizer
 
-    def _normalized(self, normalizer: RunningStatisticsState, observation: jax.Array) -> jax.Array:
-        return learning.standardize(observation, normalizer.mean, normalizer.std, self.config.normalizer_clip)
+    def _normalized(self, normalizer: RunningStatisticsState, observation: Any, part: Callable) -> jax.Array:
+        """What a network sees: its ``part`` of an observation, `of_actor` or `of_critic`, in units of its spread."""
+        mean, deviation = part(normalizer.mean), part(normalizer.std)
+        return learning.standardize(part(observation), mean, deviation, self.config.normalizer_clip)
 
-    def policy(self, actor, normalizer: RunningStatisticsState, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def policy(self, actor, normalizer: RunningStatisticsState, observation: Any) -> tuple[jax.Array, jax.Array]:
         """Mean and deviation ``[..., J]`` of the action distribution."""
-        mean, deviation = self._actor.apply(actor, self._normalized(normalizer, observation))
+        mean, deviation = self._actor.apply(actor, self._normalized(normalizer, observation, of_actor))
         return mean, deviation if self.config.learn_deviation else jax.lax.stop_gradient(deviation)
 
     def act(self, state: PPOState, deterministic: bool = False) -> Policy:
@@ -143,12 +149,12 @@ class PPO:
         hidden = [parameters[_TRUNK][f"hidden_{i}"] for i in range(len(self.config.hidden))]
         return [(np.asarray(layer["kernel"]), np.asarray(layer["bias"])) for layer in (*hidden, parameters[_MEAN])]
 
-    def value(self, state: PPOState, observation: jax.Array, age: jax.Array | None = None) -> jax.Array:
+    def value(self, state: PPOState, observation: Any, age: jax.Array | None = None) -> jax.Array:
         """Value estimates ``[...]`` after ``age [...]`` steps of an episode, which only a critic with a clock reads."""
         return self._values(state.critic, state.normalizer, observation, age)
 
     def _values(self, critic, normalizer: RunningStatisticsState, observation, age):
-        x = self._normalized(normalizer, observation)
+        x = self._normalized(normalizer, observation, of_critic)
         if self.clock:
             x = jnp.concatenate([x, age[..., None] / self.clock], axis=-1)
         return jnp.squeeze(self._critic.apply(critic, x), axis=-1)
@@ -268,7 +274,8 @@ def capped(statistics: RunningStatisticsState, most: int) -> RunningStatisticsSt
     count = statistics.count.hi.astype(jnp.float32) * 2.0**32 + statistics.count.lo.astype(jnp.float32)
     fade = jnp.minimum(1.0, most / jnp.maximum(count, 1.0))
     count = UInt64(statistics.count.hi * 0, jnp.minimum(statistics.count.lo, jnp.uint32(most)))
-    return statistics.replace(count=count, summed_variance=statistics.summed_variance * fade)
+    faded = jax.tree.map(lambda x: x * fade, statistics.summed_variance)
+    return statistics.replace(count=count, summed_variance=faded)
 
 
 def generalized_advantage(

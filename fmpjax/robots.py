@@ -81,6 +81,10 @@ class Robot:
         spec = mujoco.MjSpec.from_file(str(self.path))
         for geom in [g for g in spec.geoms if g.group == _LOOKS]:
             spec.delete(geom)
+        for geom in spec.geoms:
+            geom.material = ""
+        for look in (*spec.materials, *spec.textures):  # megabytes in each copy of the model
+            spec.delete(look)
         for name, value in numerics.items():
             spec.add_numeric(name=name, size=1, data=[value])
         model = spec.compile()

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fmpjax import jsons, tables
+from fmpjax.acting import of_actor
 from fmpjax.commands import velocity
 from fmpjax.errors import UserError
 from fmpjax.frames import FrameLayout
@@ -135,24 +136,26 @@ def play(trainer: Trainer, state: PPOState, told: np.ndarray, rng: np.random.Gen
 @partial(jax.jit, static_argnums=0)
 def _play(trainer: Trainer, state: PPOState, rows: jax.Array, told: jax.Array):
     env, layout = trainer.env, FrameLayout.of(trainer.robot)
-    policy, start = trainer.ppo.act(state, deterministic=True), env.start_at(rows)
+    policy, start = trainer.ppo.act(state, deterministic=True), env.undisturbed(env.start_at(rows))
 
-    def step(carry, command):
-        sim, observed, alive = carry
+    def step(carry, inputs):
+        (now, alive), (command, drawn) = carry, inputs
+        now, seen = env.look(now._replace(command=now.command._replace(value=command)), drawn)
         with trainer.precision():
-            action, _ = policy.act(env.seen(observed.actor, start.command._replace(value=command)), None)
-        reached = env.advance(sim, action)
+            action, _ = policy.act(of_actor(seen), None)
+        reached = env.advance(now.physics, action, now.disturbed, drawn)
 
         def hold(new, old):
             return jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-        sim, observed = jax.tree.map(hold, (reached.physics, reached.observed), (sim, observed))
+        sim, observed = jax.tree.map(hold, (reached.physics, reached.observed), (now.physics, now.observed))
+        now = now._replace(physics=sim, observed=observed, disturbed=reached.disturbed)
         alive = alive & ~reached.fell
         place = observed.frame[..., layout.root][..., :2]
-        return (sim, observed, alive), (velocity.heading_velocity(observed.frame, layout), place, alive)
+        return (now, alive), (velocity.heading_velocity(observed.frame, layout), place, alive)
 
-    carry = start.physics, start.observed, jnp.ones(len(rows), bool)
-    (_, _, alive), (velocities, places, lives) = jax.lax.scan(step, carry, told)
+    drawn = env.disturbance_draws(jax.random.PRNGKey(0), len(told), len(rows))
+    (_, alive), (velocities, places, lives) = jax.lax.scan(step, (start, jnp.ones(len(rows), bool)), (told, drawn))
     return velocities, places, lives, ~alive
 
 

@@ -44,7 +44,8 @@ class Trainer:
         self.robot = robots.load(config.robot)
         for clip in self.library.clips:
             _check(clip, self.robot, config)
-        self.env = Env(self.robot, self.library, config, physics.make(self.robot, config.physics))
+        backend = physics.make(self.robot, config.physics, joint_friction=bool(config.disturbance.joint_friction))
+        self.env = Env(self.robot, self.library, config, backend)
         clock = config.env.longest_episode if priors.remembers(config.method) else 0
         self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo, clock)
         windows, share = self.env.clip_windows(), self.env.window_share()

@@ -92,7 +92,7 @@ def test_train_takes_a_configuration_and_changes_and_resumes(trained):
     ("arguments", "sentence"),
     [
         ({"minutes": 0}, "minutes is 0: expected more than 0"),
-        ({"preset": "smok"}, "unknown preset 'smok': expected one of smoke, laptop, paper"),
+        ({"preset": "smok"}, "unknown preset 'smok': expected one of smoke, laptop, robust, robot, paper"),
         ({"methd": "fmp"}, "unknown setting 'methd': did you mean 'method'"),
         ({"config": "smoke"}, "config is 'smoke' and preset is None: expected a Config or the name of a preset"),
         ({"config": fmpjax.preset("smoke"), "preset": "paper"}, "preset is 'paper': expected a Config or the name of"),

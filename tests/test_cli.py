@@ -105,7 +105,7 @@ def test_bad_setting(refused, arguments, expected):
 
 @pytest.mark.parametrize("command", [("train", "--preset", "nope"), ("config", "nope")])
 def test_unknown_preset(refused, command):
-    assert "unknown preset 'nope': expected one of smoke, laptop, paper" in refused(*command)
+    assert "unknown preset 'nope': expected one of smoke, laptop, robust, robot, paper" in refused(*command)
 
 
 def test_unknown_experiment(refused):

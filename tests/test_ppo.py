@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fmpjax.acting import Seen
 from fmpjax.config import PPOConfig
 from fmpjax.ppo import PPO, Batch, adapt_rate, generalized_advantage
 
@@ -430,6 +431,32 @@ def test_normalised_observations_are_clipped():
     ppo, state, update = whole_batch()
     far = ppo.value(state, jnp.array([[10.0], [1e6]]))
     np.testing.assert_array_equal(far[0], far[1])
+
+
+# --- a critic that sees more -----------------------------------------------------------------------------------------
+
+
+def test_each_network_sees_its_own_part():
+    ppo = PPO(Seen(2, 3), 1, PROBE)
+    state = ppo.init(jax.random.PRNGKey(0))
+    seen = Seen(jnp.ones((4, 2)), jnp.ones((4, 3)))
+    (mean, _), value = ppo.policy(state.actor, state.normalizer, seen), ppo.value(state, seen)
+    other_critic, other_actor = seen._replace(critic=2 * seen.critic), seen._replace(actor=2 * seen.actor)
+    np.testing.assert_array_equal(ppo.policy(state.actor, state.normalizer, other_critic)[0], mean)
+    np.testing.assert_array_equal(ppo.value(state, other_actor), value)
+    assert (ppo.policy(state.actor, state.normalizer, other_actor)[0] != mean).all()
+    assert (ppo.value(state, other_critic) != value).all()
+    # What only the critic reads may stand alone.
+    np.testing.assert_array_equal(ppo.value(state, seen.critic), value)
+
+
+def test_both_parts_have_running_statistics_that_may_forget():
+    ppo = PPO(Seen(2, 3), 1, dataclasses.replace(PROBE, normalizer_count=10))
+    seen = Seen(jax.random.normal(jax.random.PRNGKey(0), (5, 8, 2)), 7.0 + jnp.zeros((5, 8, 3)))
+    normalizer = ppo.observe(ppo.init(jax.random.PRNGKey(0)).normalizer, seen)
+    np.testing.assert_allclose(normalizer.mean.actor, seen.actor.mean((0, 1)), atol=1e-6)
+    np.testing.assert_allclose(normalizer.mean.critic, 7.0, rtol=1e-6)
+    assert int(normalizer.count.lo) == 10
 
 
 # --- numbers that are not finite -------------------------------------------------------------------------------------

@@ -87,11 +87,11 @@ def test_the_list_of_studies_imports_none_of_them():
 def test_help_names_the_defaults_of_training(shown):
     text = " ".join(re.sub("[│\n]", " ", shown("fmpjax", "train", "--help")).split())
     for option, value in {
-        "method STR": "fmp", "motion STR": "walk",
-        "robot STR": "unitree_g1 in smoke and laptop, unitree_g1_29dof in paper",
+        "method STR": "fmp", "motion STR": "walk in smoke and laptop and robust and paper, gaits in robot",
+        "robot STR": "unitree_g1 in smoke and laptop and robust and robot, unitree_g1_29dof in paper",
         "reset STR": "dataset", "seed INT": "0",
         "preset STR": "laptop on a CPU, paper on an accelerator",
-        "transitions INT": "10,240 in smoke, 6,000,000 in laptop, 50,003,968 in paper",
+        "transitions INT": "10,240 in smoke, 6,000,000 in laptop, 16,000,000 in robust and robot, 50,003,968 in paper",
     }.items():  # fmt: skip
         assert re.search(rf"--{option} [^(]*(\([^d][^(]*)*\(default: {value}\)", text), option
 
@@ -99,7 +99,7 @@ def test_help_names_the_defaults_of_training(shown):
 def test_a_default_that_depends_on_the_preset_says_so(monkeypatch):
     monkeypatch.setattr(config.presets, "PRESETS", config.PRESETS | {"paper": {"robot": "another"}})
     said = cli_train._setting("robot").help_behavior_hint
-    assert said == "(default: unitree_g1 in smoke and laptop, another in paper)"
+    assert said == "(default: unitree_g1 in smoke and laptop and robust and robot, another in paper)"
     assert cli_train._setting("method").help_behavior_hint == "(default: fmp)"
 
 

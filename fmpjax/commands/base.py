@@ -19,6 +19,8 @@ class Command(NamedTuple):
     # command that is held is held on.
     advance: Callable[[Any, Any, jax.Array], "Told"]
     observe: Callable[[Any], jax.Array]  # state -> [N, size]
+    # state -> [N, ...], what beside that a critic sees that sees more than the actor; None for nothing
+    reveal: Callable[[Any], jax.Array] | None = None
 
 
 class Told(NamedTuple):

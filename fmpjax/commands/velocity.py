@@ -83,7 +83,7 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
         turning = 1.0 / (1.0 + (off[..., 2] / config.turn_width) ** 2)
         return (1.0 - config.turn_share) * linear + config.turn_share * turning
 
-    return Command(3, draw, begin, advance, lambda state: state.value)
+    return Command(3, draw, begin, advance, lambda state: state.value, lambda state: state.off)
 
 
 def extent(config: CommandConfig, library: MotionLibrary) -> np.ndarray:

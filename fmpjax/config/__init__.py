@@ -4,6 +4,7 @@ Numbers that cannot be set stand where they are used. They define a figure (at t
 part of a formula (in `env`, `ppo`, `features`, `transport`, `potential` and `priors`) or size a study (`experiments`).
 """
 
+from fmpjax.config.disturbance import DisturbanceConfig
 from fmpjax.config.presets import COMMANDS, DESCRIPTIONS, PRESETS, commanded, preset
 from fmpjax.config.reading import flatten, from_json, read, to_json, validate, with_changes
 from fmpjax.config.sections import (
@@ -32,6 +33,7 @@ __all__ = [
     "AdversaryConfig",
     "CommandConfig",
     "Config",
+    "DisturbanceConfig",
     "EnvConfig",
     "FeatureConfig",
     "GAILConfig",

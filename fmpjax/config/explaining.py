@@ -9,9 +9,10 @@ import textwrap
 from collections.abc import Mapping
 from typing import Any
 
+from fmpjax.config.base import SOURCES, Section
 from fmpjax.config.presets import DESCRIPTIONS, PRESETS, preset
 from fmpjax.config.reading import described, flatten, types
-from fmpjax.config.sections import SOURCES, Config, Section
+from fmpjax.config.sections import Config
 from fmpjax.errors import UserError
 
 

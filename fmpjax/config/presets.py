@@ -108,6 +108,36 @@ _SMOKE: dict[str, Any] = _LAPTOP | {
     "ppo.hidden": (64, 64),
 }
 
+# Stays up where ``laptop`` falls, and observes what a robot senses.
+_ROBUST: dict[str, Any] = _LAPTOP | {
+    "transitions": 16_000_000,  # three quarters of an hour
+    "env.observation": "deployable",  # no height and no linear velocity
+    "env.axes": "heading",  # of what the critic observes: a push has any direction
+    "features.axes": "heading",  # a push may turn the robot for good
+    "disturbance.friction": (0.3, 1.5),  # as far as the evaluation goes; mjlab's is 0.3 to 1.2
+    "disturbance.torso_mass": (-1.0, 3.0),  # unitree_rl_lab's and HoloSoma's
+    "disturbance.torso_center": (0.025, 0.025, 0.03),  # mjlab's
+    "disturbance.stiffness": (0.9, 1.1),  # HoloSoma's
+    "disturbance.damping": (0.9, 1.1),  # HoloSoma's
+    "disturbance.strength": (0.9, 1.0),  # a warm motor
+    # No joint friction: its constraints cost a third of the rate.
+    "disturbance.armature": (1.0, 1.05),  # Playground's
+    "disturbance.slope": 0.03,  # a floor that is not level
+    "disturbance.encoder_bias": 0.015,  # mjlab's
+    "disturbance.delay": (0, 4),  # up to 40 ms, twice HoloSoma's
+    "disturbance.turn_noise": 0.2,  # mjlab's
+    "disturbance.tilt_noise": 0.05,  # mjlab's
+    "disturbance.angle_noise": 0.01,  # mjlab's
+    "disturbance.velocity_noise": 1.5,  # mjlab's
+    "disturbance.push_interval": (1.0, 3.0),  # mjlab's
+    "disturbance.push_speed": (0.0, 1.0),  # twice mjlab's
+    "disturbance.push_lift": 0.4,  # mjlab's
+    "disturbance.push_tilt": 0.52,  # mjlab's
+    "disturbance.push_turn": 0.78,  # mjlab's
+    "disturbance.push_start": 0.3,  # a policy that cannot walk learns nothing of a large push
+    "disturbance.push_growth": 0.005,  # to full size in 140 rollouts that most episodes survive
+}
+
 # What goes with a command unless it is set otherwise: neither the policy nor the prior knows which way is north.
 COMMANDS: Mapping[str, Mapping[str, Any]] = {
     "none": {},
@@ -139,10 +169,18 @@ def commanded(kind: str | None, changes: Mapping[str, Any]) -> dict[str, Any]:
     return {**COMMANDS[kind], **changes}
 
 
-PRESETS: Mapping[str, Mapping[str, Any]] = {"smoke": _SMOKE, "laptop": _LAPTOP, "paper": {}}
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "smoke": _SMOKE,
+    "laptop": _LAPTOP,
+    "robust": _ROBUST,
+    "robot": _ROBUST | COMMANDS["velocity"],
+    "paper": {},
+}
 DESCRIPTIONS = {
     "smoke": "the whole path in a minute; learns nothing",
     "laptop": "walks after about a quarter of an hour on two cores",
+    "robust": "`laptop` with disturbances, and only what a robot senses; three quarters of an hour",
+    "robot": "`robust`, and steered by commanded velocities: for a real robot",
     "paper": "the paper's setting, for an accelerator",
 }
 

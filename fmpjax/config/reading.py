@@ -16,7 +16,8 @@ import numpy as np
 from msgspec import inspect as kinds
 
 from fmpjax import jsons
-from fmpjax.config.sections import Config, Section
+from fmpjax.config.base import Section
+from fmpjax.config.sections import Config
 from fmpjax.errors import UserError
 
 

@@ -6,39 +6,23 @@ rule about several fields stands in the ``check`` of their section, or of `Confi
 """
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from fmpjax.config.base import (
+    Decay,
+    Fraction,
+    NonNegativeFloat,
+    NonNegativeInt,
+    Optimizer,
+    PositiveFloat,
+    PositiveInt,
+    Section,
+    Widths,
+)
+from fmpjax.config.disturbance import DisturbanceConfig
 from fmpjax.errors import UserError
-
-# What the letters at the end of the comments stand for.
-SOURCES: Mapping[str, str] = {
-    "P": "the paper",
-    "M": "MimicKit, the code base that the paper builds on",
-    "A": "acme's GAIL",
-    "W": "WAIL (arXiv 1906.08113)",
-    "L": "PWIL (arXiv 2006.04678)",
-    "S": "SMP in MimicKit",
-    "D": "decided here, where these are silent",
-}
-
-PositiveInt = Annotated[int, Meta(ge=1)]
-NonNegativeInt = Annotated[int, Meta(ge=0)]
-PositiveFloat = Annotated[float, Meta(gt=0)]
-NonNegativeFloat = Annotated[float, Meta(ge=0)]
-Fraction = Annotated[float, Meta(gt=0, le=1)]
-Decay = Annotated[float, Meta(ge=0, lt=1)]  # what remains of an average in a step
-Widths = tuple[PositiveInt, ...]  # units of the hidden layers
-Optimizer = Literal["sgd", "adam"]
-
-
-class Section:
-    """What every section has."""
-
-    def check(self) -> None:
-        """Raise a `UserError` where the section's values do not go together."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +58,9 @@ class EnvConfig(Section):
     cap_growth: PositiveFloat = 1.25  # factor per growth step [D]
     cap_share: NonNegativeFloat = 0.75  # share of episodes that end by the cap above which the cap grows [D]
     cap_patience: NonNegativeInt = 25  # rollouts between two growth steps at least [D]
-    observation: Literal["full", "compact"] = "full"  # 237 numbers [P], or 86 that carry the same information [D]
+    # 237 numbers [P], 86 that carry the same information, or what a robot senses, docs/robustness.md ("deployable") [D]
+    observation: Literal["full", "compact", "deployable"] = "full"
+    observation_history: PositiveInt = 1  # control steps of which a deployable policy sees its sensors [D]
     axes: Literal["world", "heading"] = "world"  # of observed vectors [P]; "heading": x where the root faces [D]
     # 1.4 max|limit| around zero [M], or "residual": 0.25 effort/kp around the demonstration's mean pose [D]
     action: Literal["absolute", "residual"] = "absolute"
@@ -83,6 +69,14 @@ class EnvConfig(Section):
     def longest_episode(self) -> int:
         """Control steps of the longest episode in training."""
         return max(self.first_cap, min(self.last_cap, self.episode_steps))
+
+    def check(self) -> None:
+        """Raise a `UserError` where a history is asked for of an observation that has none."""
+        if self.observation_history > 1 and self.observation != "deployable":
+            raise UserError(
+                f"setting env.observation_history is {self.observation_history} and env.observation "
+                f"{self.observation!r}: expected 1, since only 'deployable' has a history"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -333,6 +327,7 @@ class Config(Section):
     physics: PhysicsConfig = PhysicsConfig()
     env: EnvConfig = EnvConfig()
     command: CommandConfig = CommandConfig()
+    disturbance: DisturbanceConfig = DisturbanceConfig()
     features: FeatureConfig = FeatureConfig()
     prior: PriorConfig = PriorConfig()
     amp: AMPConfig = AMPConfig()

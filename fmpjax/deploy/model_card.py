@@ -100,6 +100,8 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
     rows, start = [], 0
     for name, width in features.observation_terms(robot, policy.observation).items():
         meaning = _MEANING[name].format(points=", ".join(robot.key_point_names))
+        if (steps := features.observation_history(policy.observation)) > 1:
+            meaning += f"; of {steps} steps, the oldest first"
         if name == "joint_rotation_6d" and robot.jointless_row is not None:
             meaning += f", with a row that is always 1, 0, 0, 0, 0, 1 before joint {robot.jointless_row}"
         rows.append(tables.row((str(start), str(start + width - 1), f"`{name}`", meaning)))
@@ -122,7 +124,7 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
         physics_rate=1.0 / config.physics.timestep,
         motions="\n".join(tables.row((Path(name).name, f"{w:g}", _license(name))) for name, w in origin.motions),
         evaluation=_evaluated(origin.evaluation),
-        robustness=_robustness(origin.evaluation),
+        robustness=_robustness(origin.evaluation, origin.robustness),
         size=start,
         observation="\n".join(rows),
         joints=len(policy.joint_names),
@@ -150,18 +152,23 @@ def _evaluated(figures: dict[str, Any] | None) -> str:
     )
 
 
-def _robustness(figures: dict[str, Any] | None) -> str:
+def _robustness(figures: dict[str, Any] | None, robustness: dict[str, Any] | None) -> str:
     starts = (figures or {}).get("starts") or []
     rows = [tables.row((f"{start['noise']:g}", str(start["falls"]), str(start["episodes"]))) for start in starts]
-    if not rows:
-        return "No disturbance was tried on this policy."
-    return "\n".join(
-        [
-            "Falls by the noise of the joint angles at the start, rad; ten times that, rad/s, of their velocities. "
-            "Pushes, delays and other floors were not tried.",
+    cells = (robustness or {}).get("cells") or []
+    parts = []
+    if cells:
+        headings = ("disturbance", "size", "falls", "first episodes")
+        tried = [(c["disturbance"], c["size"], str(c["falls"]), str(c["episodes"])) for c in cells]
+        parts += ["Falls under disturbances, as docs/robustness.md of fmpjax explains them.", ""]
+        parts += [tables.markdown(headings, tried, texts=2), ""]
+    if rows:
+        parts += [
+            "Falls by the noise of the joint angles at the start, rad; ten times that, rad/s, of their velocities."
+            + ("" if cells else " Pushes, delays and other floors were not tried."),
             "",
             "| noise | falls | first episodes |",
             "|---|---|---|",
             *rows,
         ]
-    )
+    return "\n".join(parts).rstrip() or "No disturbance was tried on this policy."

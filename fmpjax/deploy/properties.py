@@ -17,6 +17,7 @@ from fmpjax.robots import Robot
 def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
     """What the file says of itself, text by key."""
     terms, physics = features.observation_terms(robot, policy.observation), origin.config.physics
+    steps = features.observation_history(policy.observation)
     # As `fmpjax.physics` steps it, whatever the file of the robot says.
     trained = robot.physics_model(frictionloss=physics.frictionloss)
     facts = sim2sim.facts(trained, policy.joint_names)
@@ -31,7 +32,7 @@ def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
         "observation_names": _list(terms),
         "observation_terms_scale": _list([1.0] * len(terms)),
         "observation_terms_flatten_history_dim": _list([1] * len(terms)),  # truth is a number in mjlab's text
-        "observation_terms_history_length": _list([0] * len(terms)),
+        "observation_terms_history_length": _list([steps if steps > 1 else 0] * len(terms)),
         "observation_terms_clip": _list(["-inf;inf"] * len(terms)),
         "action_scale": _list(policy.scale),
     }

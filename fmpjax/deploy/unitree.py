@@ -41,6 +41,7 @@ def stock(policy: Policy, robot: Robot, origin: Origin) -> str:
     terms = features.observation_terms(robot, policy.observation)
     if "velocity_commands" in terms and origin.commands is None:
         raise UserError("the policy takes commands of no known range: expected lin_vel_x, lin_vel_y and ang_vel_z")
+    steps = features.observation_history(policy.observation)
     commands = {name: list(span) for name, span in (origin.commands or {}).items()}
     action = {
         "clip": np.stack([policy.low, policy.high], -1).astype(float).tolist(),
@@ -58,7 +59,7 @@ def stock(policy: Policy, robot: Robot, origin: Origin) -> str:
         "commands": {"base_velocity": {"ranges": commands | {"heading": None}}} if commands else {},
         "actions": {"JointPositionAction": action},
         "observations": {
-            name: {"params": {}, "clip": None, "scale": [1.0] * width, "history_length": 1}
+            name: {"params": {}, "clip": None, "scale": [1.0] * (width // steps), "history_length": steps}
             for name, width in terms.items()
         },
     }

@@ -297,7 +297,8 @@ def track(trainer: Trainer) -> dict[str, float]:
     def play(carried):
         def step(sim, inputs):
             action, q, v = inputs
-            sim, _, fell, _ = env.advance(sim, action[None].astype(jnp.float32))
+            reached = env.advance(sim, action[None].astype(jnp.float32))
+            sim, fell = reached.physics, reached.fell
             error = sim.qpos[0, 7:] - q[7:]
             if carried:
                 sim = sim._replace(qpos=sim.qpos.at[0, :7].set(q[:7]), qvel=sim.qvel.at[0, :6].set(v[:6]))

@@ -4,11 +4,15 @@ import jax
 
 from fmpjax.config import PhysicsConfig
 from fmpjax.physics.base import Physics, PhysicsState, reset
+from fmpjax.physics.traits import Traits
 from fmpjax.robots import Robot
 
 
-def make(robot: Robot, config: PhysicsConfig) -> Physics:
-    """The backend that the configuration names; ``auto`` is MJX where JAX sees an accelerator, else MuJoCo C."""
+def make(robot: Robot, config: PhysicsConfig, *, joint_friction: bool = False) -> Physics:
+    """The backend that the configuration names; ``auto`` is MJX where JAX sees an accelerator, else MuJoCo C.
+
+    With ``joint_friction`` traits may give the joints dry friction where the model has none.
+    """
     backend = config.backend
     if backend == "auto":
         backend = "native" if jax.default_backend() == "cpu" else "mjx"
@@ -16,10 +20,10 @@ def make(robot: Robot, config: PhysicsConfig) -> Physics:
     if backend == "mjx":
         from fmpjax.physics.mjx import MjxPhysics
 
-        return MjxPhysics(robot, config)
+        return MjxPhysics(robot, config, joint_friction=joint_friction)
     from fmpjax.physics.native import NativePhysics
 
     return NativePhysics(robot, config)
 
 
-__all__ = ["Physics", "PhysicsState", "make", "reset"]
+__all__ = ["Physics", "PhysicsState", "Traits", "make", "reset"]

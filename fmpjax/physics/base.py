@@ -5,6 +5,8 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from fmpjax.physics.traits import Traits
+
 
 class PhysicsState(NamedTuple):
     """Physical state of N robots; all that a backend needs to go on."""
@@ -19,8 +21,14 @@ class Physics(Protocol):
 
     name: str
 
-    def step(self, state: PhysicsState, targets: jax.Array) -> PhysicsState:
-        """Advance one control step with joint targets ``[N, J]`` (rad) held by the servos."""
+    def step(self, state: PhysicsState, targets: jax.Array, traits: Traits | None = None) -> PhysicsState:
+        """Advance one control step with joint targets (rad) held by the servos.
+
+        Args:
+          state: of N robots.
+          targets: ``[N, J]``, or ``[N, S, J]`` of each physics step.
+          traits: in what the robots and their floors differ from the model.
+        """
         ...
 
 

@@ -1,16 +1,19 @@
 """MJX: the physics on the device, for accelerators."""
 
+import functools
 from typing import NoReturn
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from fmpjax import machine
 from fmpjax.config import PhysicsConfig
 from fmpjax.errors import UserError
 from fmpjax.physics.base import PhysicsState
 from fmpjax.physics.native import model
+from fmpjax.physics.traits import Nominal, Traits, changed, unpacked
 from fmpjax.robots import Robot
 
 machine.import_mjx()
@@ -23,8 +26,9 @@ class MjxPhysics:
 
     name = "mjx"
 
-    def __init__(self, robot: Robot, config: PhysicsConfig):
-        self.config = config
+    def __init__(self, robot: Robot, config: PhysicsConfig, *, joint_friction: bool = False):
+        """The backend; with ``joint_friction`` traits may give the joints dry friction where the model has none."""
+        self.robot, self.config = robot, config
         limits = {}
         if robot.self_collision and config.impl == "jax":
             # MJX in JAX works on every pair of geoms at every step: of a pair of shapes' kinds the nearest are kept.
@@ -42,6 +46,8 @@ class MjxPhysics:
             self.model.opt.ls_iterations = min(config.ls_iterations, 6)
             # A tolerance made for float64 is never met in float32; Warp has the same floor.
             self.model.opt.tolerance = max(self.model.opt.tolerance, 1e-6)
+            if joint_friction:  # MJX makes room for it where the model has any
+                self.model.dof_frictionloss[6:] = np.maximum(self.model.dof_frictionloss[6:], 1e-6)
             self._model = mjx.put_model(self.model, impl=config.impl, device=self._device)
 
         self._step = jax.custom_batching.custom_vmap(self._advance)
@@ -78,17 +84,32 @@ class MjxPhysics:
             buffers = {"naconmax": count * config.max_contacts, "njmax": config.max_constraints}
         return mjx.make_data(self.model, impl=config.impl, device=self._device, **buffers)
 
-    def step(self, state: PhysicsState, targets: jax.Array) -> PhysicsState:
-        return PhysicsState(*self._step(*state, jnp.asarray(targets, state.qpos.dtype)))
+    def step(self, state: PhysicsState, targets: jax.Array, traits: Traits | None = None) -> PhysicsState:
+        targets = jnp.asarray(targets, state.qpos.dtype).reshape(len(targets), -1)
+        if traits is None:
+            return PhysicsState(*self._step(*state, targets))
+        if self.config.impl == "warp":
+            _refuse("there every robot has one model: expected physics.impl 'jax' with disturbances of robot or floor")
+        return PhysicsState(*self._step(*state, targets, traits.packed.astype(state.qpos.dtype)))
+
+    @functools.cached_property
+    def _nominal(self) -> Nominal:
+        return Nominal.of(self.robot, self.model)
 
     def _advance(self, *arguments: jax.Array) -> tuple[jax.Array, ...]:
         template = self._data(len(arguments[0]))
 
-        def one(qpos, qvel, warmstart, target):
-            data = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=target)
-            data, _ = jax.lax.scan(
-                lambda d, _: (mjx.step(self._model, d), None), data, None, length=self.config.substeps
-            )
+        def one(qpos, qvel, warmstart, targets, *traits):
+            model = self._model
+            if traits:
+                fields = changed(self._nominal, unpacked(traits[0]), jnp)
+                model = model.tree_replace({name: jnp.asarray(x, qpos.dtype) for name, x in fields.items()})
+            data = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+            if (several := targets.reshape(-1, self.model.nu)).shape[0] > 1:
+                data, _ = jax.lax.scan(lambda d, x: (mjx.step(model, d.replace(ctrl=x)), None), data, several)
+            else:
+                data = data.replace(ctrl=targets)
+                data, _ = jax.lax.scan(lambda d, _: (mjx.step(model, d), None), data, None, length=self.config.substeps)
             reached = data.qpos, data.qvel, data.qacc_warmstart
             if not self._overflow:
                 return reached

@@ -4,7 +4,10 @@ On a CPU this is an order of magnitude faster than MJX. The function is pure: th
 alone.
 """
 
+import copy
+import functools
 import hashlib
+import operator
 import threading
 
 import jax
@@ -17,10 +20,13 @@ from fmpjax import machine
 from fmpjax.config import PhysicsConfig
 from fmpjax.physics import ffi
 from fmpjax.physics.base import PhysicsState
+from fmpjax.physics.traits import Nominal, Traits, changed, unpacked
 from fmpjax.robots import Robot
 
 # The backend that serves a name; XLA keeps its address for good, so those of the same name share its threads.
 _FIRST: dict[str, "NativePhysics"] = {}
+# Models of robots with traits that are kept at least, a tenth of a megabyte each.
+_KEPT = 1024
 
 
 class NativePhysics:
@@ -29,43 +35,51 @@ class NativePhysics:
     name = "native"
 
     def __init__(self, robot: Robot, config: PhysicsConfig):
-        self.model = model(robot, config)
+        self.robot, self.model = robot, model(robot, config)
         self.substeps = config.substeps
         self.threads = config.threads or machine.cores()
         # All that a step depends on is in the name, by which a program that was kept finds it.
         image = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, image)
-        told = f"{config.substeps} {config.threads}".encode() + image.tobytes()
+        told = f"{config.substeps} {config.threads} {robot.landmarks.get('chest')}".encode() + image.tobytes()
         self._function = f"fmpjax_native_{hashlib.sha256(told).hexdigest()[:16]}"
-        if (first := _FIRST.setdefault(self._function, self)) is not self:
-            self._pool, self._data, self._turn = first._pool, first._data, first._turn
+        self._first = _FIRST.setdefault(self._function, self)
+        if self._first is not self:
             return
         self._pool = mujoco.rollout.Rollout(nthread=self.threads)
         self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
         self._turn = threading.Lock()  # several devices call back at once; the threads serve one after another
+        self._models: dict[bytes, mujoco.MjModel] = {}  # by their traits
         ffi.register(self._function, self._advance)
 
-    def step(self, state: PhysicsState, targets: jax.Array) -> PhysicsState:
+    def step(self, state: PhysicsState, targets: jax.Array, traits: Traits | None = None) -> PhysicsState:
         # One array each way: every array that crosses to the host costs tens of microseconds.
-        packed = jnp.concatenate([*state, targets.astype(state.qpos.dtype)], axis=-1)
+        dtype = state.qpos.dtype
+        name, advance = self._function, self._first._advance
+        parts = [*state, targets.astype(dtype)]
+        if targets.ndim == 3 or traits is not None:
+            sequence = targets.shape[-2] if targets.ndim == 3 else 1
+            known = 0 if traits is None else traits.packed.shape[-1]
+            parts[-1] = parts[-1].reshape(len(targets), -1)
+            parts += [] if traits is None else [traits.packed.astype(dtype)]
+            name = f"{name}_{sequence}_{known}"
+            advance = functools.partial(advance, sequence=sequence, traits=known)
+            ffi.register(name, advance)
+        packed = jnp.concatenate(parts, axis=-1)
         nq, nv = self.model.nq, self.model.nv
         if jax.default_backend() == "cpu":
-            reached = ffi.call(self._function, packed, nq + 2 * nv)
+            reached = ffi.call(name, packed, nq + 2 * nv)
         else:
             shape = jax.ShapeDtypeStruct((*packed.shape[:-1], nq + 2 * nv), packed.dtype)
-            reached = jax.pure_callback(self._called, shape, packed, vmap_method="broadcast_all")
+            called = functools.partial(_called, advance, nq + 2 * nv)
+            reached = jax.pure_callback(called, shape, packed, vmap_method="broadcast_all")
         return PhysicsState(*jnp.split(reached, (nq, nq + nv), axis=-1))
 
-    def _called(self, packed) -> np.ndarray:
-        packed = np.asarray(packed)
-        reached = np.empty((*packed.shape[:-1], self.model.nq + 2 * self.model.nv), packed.dtype)
-        self._advance(packed, reached)
-        return reached
+    def _advance(self, packed: np.ndarray, reached: np.ndarray, *, sequence: int = 1, traits: int = 0) -> None:
+        """Fill rows ``qpos, qvel, warmstart`` after a control step of rows ``qpos, qvel, warmstart, targets, traits``.
 
-    def _advance(self, packed: np.ndarray, reached: np.ndarray) -> None:
-        """Fill rows ``qpos, qvel, warmstart`` after a control step of rows ``qpos, qvel, warmstart, targets``.
-
-        Batches of batches, as `jax.vmap` makes them, are advanced at once.
+        Batches of batches, as `jax.vmap` makes them, are advanced at once. A row has targets of ``sequence`` physics
+        steps, one for all of them or as many as there are, and ``traits`` numbers of traits.
         """
         packed, reached = (x.reshape(-1, x.shape[-1]) for x in (packed, reached))
         count, nq, nv = len(packed), self.model.nq, self.model.nv
@@ -73,10 +87,12 @@ class NativePhysics:
         # MuJoCo's full physics state begins with the time, which nothing here depends on.
         initial = np.zeros((count, 1 + nq + nv))
         initial[:, 1:] = packed[:, : nq + nv]
-        control = np.repeat(packed[:, None, nq + 2 * nv :].astype(np.float64), self.substeps, axis=1)
+        targets = packed[:, nq + 2 * nv : packed.shape[1] - traits].reshape(count, sequence, -1)
+        control = np.repeat(targets.astype(np.float64), self.substeps // sequence, axis=1)
         with self._turn:
+            models = self._with_traits(packed[:, packed.shape[1] - traits :]) if traits else [self.model] * count
             states, _ = self._pool.rollout(
-                [self.model] * count,
+                models,
                 self._data,
                 initial,
                 control,
@@ -90,6 +106,35 @@ class NativePhysics:
         reached[:, : nq + nv] = states[:, -1, 1:]
         # The rollout does not return its solver's last acceleration; the last velocity step stands in.
         reached[:, nq + nv :] = (states[:, -1, 1 + nq :] - before[:, 1 + nq :]) / self.model.opt.timestep
+
+    def _with_traits(self, rows: np.ndarray) -> list[mujoco.MjModel]:
+        """A model for each row of traits; models are kept, since a robot's traits stay for a whole run."""
+        keys = [row.tobytes() for row in rows]
+        if len(self._models) > max(_KEPT, 2 * len(rows)):
+            self._models.clear()
+        for key, row in zip(keys, rows, strict=True):
+            if key not in self._models:
+                self._models[key] = self._model_of(unpacked(row.astype(np.float64)))
+        return [self._models[key] for key in keys]
+
+    def _model_of(self, traits: Traits) -> mujoco.MjModel:
+        built = copy.copy(self.model)
+        for name, value in changed(self._nominal, traits).items():
+            operator.attrgetter(name)(built)[:] = value
+        # The torso's center of mass may no longer be where MuJoCo's shortcuts for it hold.
+        built.body_sameframe[self._nominal.torso] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        return built
+
+    @functools.cached_property
+    def _nominal(self) -> Nominal:
+        return Nominal.of(self.robot, self.model)
+
+
+def _called(advance, width: int, packed) -> np.ndarray:
+    packed = np.asarray(packed)
+    reached = np.empty((*packed.shape[:-1], width), packed.dtype)
+    advance(packed, reached)
+    return reached
 
 
 def model(robot: Robot, config: PhysicsConfig, **numerics: float) -> mujoco.MjModel:

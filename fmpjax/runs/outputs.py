@@ -4,6 +4,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from fmpjax.trainer import Trainer
 from fmpjax.viz import curves, render
 
 _EXPORTED = (
-    "metrics.csv evaluation.json ranking-start.json ranking.json curves.png frames.png policy.mp4 policy.gif"
+    "metrics.csv evaluation.json robustness.json robustness.png ranking-start.json ranking.json curves.png frames.png "
+    "policy.mp4 policy.gif"
 ).split()
 
 
@@ -100,11 +102,7 @@ def export(run: Run, out: Path, *, onnx: bool = False) -> list[Path]:
 
 def _origin(run: Run) -> deploy.Origin:
     """Where the run's policy comes from, as its ONNX file and its card say."""
-    path = run.folder / "evaluation.json"
-    try:
-        evaluation = json.loads(path.read_text()) if path.exists() else None
-    except ValueError:
-        raise UserError(f"{path} is not valid JSON: expected what `fmpjax evaluate` writes") from None
+    evaluation, robustness = (_figures(run.folder / name) for name in ("evaluation.json", "robustness.json"))
     return deploy.Origin(
         run=run.folder.resolve().name,
         config=run.config,
@@ -113,7 +111,16 @@ def _origin(run: Run) -> deploy.Origin:
         evaluation=evaluation,
         changed=bool(run.provenance().get("uncommitted_changes")),
         commands=_commands(run),
+        robustness=robustness,
     )
+
+
+def _figures(path: Path) -> dict[str, Any] | None:
+    """What an evaluation wrote; None where it was not made."""
+    try:
+        return json.loads(path.read_text()) if path.exists() else None
+    except ValueError:
+        raise UserError(f"{path} is not valid JSON: expected what `fmpjax evaluate` writes") from None
 
 
 def _commands(run: Run) -> dict[str, tuple[float, float]] | None:

@@ -17,6 +17,7 @@ class Policy(NamedTuple):
 
     act: Callable[[np.ndarray], np.ndarray]  # observation [O] -> actions [J]
     terms: dict[str, int]  # names and widths of the observation's parts
+    history: int  # steps of control that each part is of, the oldest first
     joint_names: tuple[str, ...]
     center: np.ndarray  # [J] rad, the targets of action zero
     scale: np.ndarray  # [J] rad, a unit of action
@@ -63,6 +64,7 @@ def load(path: str | Path) -> Policy:
         policy = Policy(
             act=lambda x: session.run(["actions"], {"obs": x[None].astype(np.float32)})[0][0],
             terms=dict(zip(said["observation_names"].split(","), widths, strict=True)),
+            history=_history(said),
             joint_names=tuple(said["joint_names"].split(",")),
             center=_numbers(said["action_offset"]),
             scale=_numbers(said["action_scale"]),
@@ -112,15 +114,29 @@ def _places(text: str, *wanted: str) -> list[dict[str, Any]]:
 
 
 def _check_plain(said: dict[str, str]) -> None:
-    """Refuse what mjlab's keys may ask for and a policy of fmpjax never does: scales, clips and histories.
+    """Refuse what mjlab's keys may ask for and a policy of fmpjax never does: scales and clips.
 
     Raises:
       ValueError: one of them is asked for.
     """
-    for key, plain in (("scale", "1.0"), ("clip", "-inf;inf"), ("history_length", "0")):
+    for key, plain in (("scale", "1.0"), ("clip", "-inf;inf")):
         values = set(said[f"observation_terms_{key}"].split(","))
         if values != {plain}:
             raise ValueError(f"observation_terms_{key} is {min(values - {plain})}, and sim2sim knows {plain} alone")
+
+
+def _history(said: dict[str, str]) -> int:
+    """Steps that each part of the observation is of.
+
+    Raises:
+      ValueError: the parts are of different numbers.
+    """
+    lengths = set(said["observation_terms_history_length"].split(","))
+    if len(lengths) != 1 or int(min(lengths)) < 0:
+        raise ValueError(
+            f"observation_terms_history_length is {', '.join(sorted(lengths))}: expected one for all terms"
+        )
+    return max(1, int(lengths.pop()))
 
 
 def _check(path: str | Path, policy: Policy, session) -> None:

@@ -66,7 +66,7 @@ class Simulation:
         self.command, self.action = np.zeros(3), np.zeros(len(ids))
         self.reset()
         for name, width in policy.terms.items():
-            if (found := np.size(TERMS[name](self))) != width:
+            if (found := policy.history * np.size(TERMS[name](self))) != width:
                 raise UserError(f"the policy's {name} has {width} numbers: expected {found}, as sim2sim makes them")
         self.differences = said + differences(policy, model, ids, self._servo, self._root_body, self.substeps)
         if self.raised:
@@ -96,7 +96,7 @@ class Simulation:
         self.raised = float(depth - _DEEPEST) if depth > _DEEPEST else 0.0
         data.qpos[self._root + 2] += self.raised
         mujoco.mj_kinematics(self.model, data)
-        self.time, self.action = 0.0, np.zeros(len(self._qpos))
+        self.time, self.action, self._past = 0.0, np.zeros(len(self._qpos)), []
 
     @property
     def qpos(self) -> np.ndarray:
@@ -122,12 +122,21 @@ class Simulation:
         return self.data.xpos[body] + offset @ self.data.xmat[body].reshape(3, 3).T
 
     def observe(self) -> np.ndarray:
-        """The policy's observation, ``[O]``."""
-        return np.concatenate([np.ravel(TERMS[name](self)) for name in self.policy.terms])
+        """The policy's observation, ``[O]``; ahead of the first steps stands the first again."""
+        newest = self._sensed()
+        before = [*[self._past[0] if self._past else newest] * self.policy.history, *self._past]
+        every = [*before, newest][-self.policy.history :]
+        return np.concatenate([step[i] for i in range(len(newest)) for step in every])
+
+    def _sensed(self) -> list[np.ndarray]:
+        """The parts of the observation of this step alone."""
+        return [np.ravel(TERMS[name](self)) for name in self.policy.terms]
 
     def step(self) -> bool:
         """One step of control; whether a body that marks a fall then touches the floor."""
-        self.action = self.policy.act(self.observe())
+        observation = self.observe()
+        self._past = [*self._past, self._sensed()][1 - self.policy.history :] if self.policy.history > 1 else []
+        self.action = self.policy.act(observation)
         self.data.ctrl[self._servo] = self.policy.center + self.policy.scale * self.action
         mujoco.mj_step(self.model, self.data, self.substeps)
         self.time = self.data.time

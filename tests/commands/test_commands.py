@@ -150,7 +150,7 @@ def test_one_motion_is_none_to_choose_from(robot, walk):
 
 def test_the_form_of_an_observation_counts_the_motions(robot):
     form = features.observation_form(preset("smoke", **{"command.kind": "motion", "motion": "walk,turn_left:2"}))
-    assert form == "compact motion:2"
+    assert form == "compact motion-2"
     assert features.observation_terms(robot, form)["motion_command"] == 2
 
 

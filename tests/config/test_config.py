@@ -121,7 +121,7 @@ def test_bad_settings_are_named(changes, words):
 
 
 def test_unknown_preset():
-    with pytest.raises(UserError, match="unknown preset 'huge': expected one of smoke, laptop, paper"):
+    with pytest.raises(UserError, match="unknown preset 'huge': expected one of smoke, laptop, robust, robot, paper"):
         configuration.preset("huge")
 
 

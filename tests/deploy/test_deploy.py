@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from fmpjax import cli, config, deploy, features, physics, policy, resources, robots, runs
+from fmpjax import cli, config, deploy, disturbances, features, physics, policy, resources, robots, runs
 from fmpjax.config import preset
 from fmpjax.env import action_map
 from fmpjax.errors import UserError
@@ -308,24 +308,35 @@ def without_a_floor(root):
 TOLD = np.array([0.3, 0.0, 0.2])  # m/s ahead and to the left, rad/s
 
 
-@pytest.fixture(scope="module", params=["compact", "full", "compact heading velocity"])
+@pytest.fixture(scope="module", params=["compact", "full", "compact heading velocity", "deployable velocity history-3"])
 def trained(request, robot, walk, tmp_path_factory):
     """Six steps of training's own physics under a small policy, and the file of that policy."""
     pytest.importorskip("onnxruntime")
     content, *told = request.param.split()
     changes = {"env.observation": content, "physics.timestep": 0.005, "physics.substeps": 4, "physics.threads": 1}
     changes |= {"env.axes": "heading", "command.kind": "velocity"} if told else {}
+    changes |= {"env.observation_history": 3} if content == "deployable" else {}
     made = small(robot, walk, **changes)
     folder = tmp_path_factory.mktemp("policy")
-    made.path, _ = deploy.write(folder, made.policy, robot, made.origin)
+    made.path, *_ = deploy.write(folder, made.policy, robot, made.origin)
     native = NativePhysics(robot, made.config.physics)
     state = physics.reset(jnp.asarray(robot.default_qpos[None], jnp.float32), jnp.zeros((1, 6 + robot.joint_count)))
-    observe, step = jax.jit(lambda *x: features.observe(robot, *x, request.param).actor), jax.jit(native.step)
+    step, command = jax.jit(native.step), TOLD if told else []
+    observe = jax.jit(lambda *x: features.observe(robot, *x, request.param).actor)
+    actions = action_map(robot, walk, made.config.env.action)
+    sensors = disturbances.make(made.config, robot, actions, len(command))
+    sensed = sensors and sensors.init(jax.random.PRNGKey(0), 1)
     made.observations, made.states = [], []
     for _ in range(6):
-        command = TOLD if told else []
-        made.observations.append(np.concatenate([observe(state.qpos, state.qvel)[0], command]).astype(np.float32))
-        state = step(state, jnp.asarray(made.policy(made.observations[-1])[None]))
+        if sensors:
+            seen, sensed = sensors.sense(sensed, state, jnp.asarray(TOLD[None], jnp.float32), jnp.zeros((1, 0)))
+            made.observations.append(np.asarray(seen[0]))
+        else:
+            made.observations.append(np.concatenate([observe(state.qpos, state.qvel)[0], command]).astype(np.float32))
+        targets = jnp.asarray(made.policy(made.observations[-1])[None])
+        if sensors:
+            (_, targets), sensed = sensors.act(sensed, state, (targets - actions.center) / actions.scale, None)
+        state = step(state, jnp.asarray(targets, jnp.float32))
         made.states.append(np.concatenate([state.qpos[0], state.qvel[0]]))
     made.options = {
         "timestep": made.config.physics.timestep,

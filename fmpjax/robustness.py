@@ -1,0 +1,291 @@
+"""How well a policy stays up: its falls, speed and excursion under each disturbance alone, and under all together."""
+
+import dataclasses
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fmpjax import jsons, metrics, physics, rotations, tables
+from fmpjax.acting import of_actor
+from fmpjax.config import Config, DisturbanceConfig
+from fmpjax.env import Env, EnvState
+from fmpjax.evaluate import episodes_of, planar_speed
+from fmpjax.ppo import PPOState
+from fmpjax.trainer import Trainer
+
+EPISODES = 256  # per cell
+SEED = 1  # of starts and disturbances
+EVERY = 2.0  # s between two pushes where pushes are alone
+Z = 1.959964  # standard deviations on either side of a 95 % interval
+
+# What peers set for the G1; docs/robustness.md.
+NOISE = {"turn_noise": 0.2, "tilt_noise": 0.05, "angle_noise": 0.01, "velocity_noise": 1.5}
+SPIN = {"push_lift": 0.4, "push_tilt": 0.52, "push_turn": 0.78}
+# mjlab draws a push of up to 0.5 m/s on each axis: 0.38 m/s on average, 0.71 m/s at most, as here in any direction.
+MJLAB = DisturbanceConfig(
+    friction=(0.3, 1.2),
+    torso_center=(0.025, 0.025, 0.03),
+    encoder_bias=0.015,
+    push_interval=(1.0, 3.0),
+    push_speed=(0.05, 0.71),
+    **SPIN,
+    **NOISE,
+)
+
+
+class Case(NamedTuple):
+    """What episodes are played under."""
+
+    disturbance: str
+    size: str  # with its unit
+    config: DisturbanceConfig
+
+
+class Cell(NamedTuple):
+    """First episodes under one disturbance."""
+
+    disturbance: str
+    size: str
+    episodes: int
+    falls: int
+    low: float  # share of falls, lower end of its 95 % interval (Wilson's)
+    high: float
+    seconds: float  # mean length of an episode
+    speed: float  # m/s along the own heading, late; of the episodes that last so long
+    speed_n: int  # episodes behind it
+    excursion: float  # of the demonstrations'
+    excursion_n: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Robustness:
+    """A policy's figures, case by case."""
+
+    cells: tuple[Cell, ...]
+    seconds: float  # of an episode without a fall
+    demonstration_speed: float  # m/s
+
+    def to_json(self) -> str:
+        """All figures; what is not defined is null."""
+        return jsons.dumps(vars(self) | {"cells": [cell._asdict() for cell in self.cells]})
+
+
+def cases(config: Config) -> list[Case]:
+    """The cases under which a run's policy is tried: none, each disturbance alone at three sizes, and all together."""
+    substeps, step = config.physics.substeps, 1e3 * config.physics.timestep
+    alone: dict[str, list[tuple[str, dict[str, Any]]]] = {
+        "push": [(f"{v:g} m/s", {"push_speed": (v, v)}) for v in (0.25, 0.5, 1.0)],
+        "push, turning": [
+            (f"{x:g} x mjlab", {"push_speed": (0.0, 0.0)} | {name: x * most for name, most in SPIN.items()})
+            for x in (1, 2, 3)
+        ],
+        "delay": [
+            (f"{k * step:g} ms", {"delay": (k, k)})
+            for k in dict.fromkeys((max(1, substeps // 2), substeps, 2 * substeps))
+        ],
+        "friction": [(f"x {v:g}", {"friction": (v, v)}) for v in (0.3, 0.5, 1.5)],
+        "torso mass": [(f"{v:+g} kg", {"torso_mass": (v, v)}) for v in (-2.0, 3.0, 6.0)],
+        "torso center": [(f"±{1e3 * v:g} mm", {"torso_center": (v, v, v)}) for v in (0.025, 0.05, 0.1)],
+        "gains": [
+            (f"± {100 * v:g} %", {"stiffness": (1 - v, 1 + v), "damping": (1 - v, 1 + v)}) for v in (0.1, 0.2, 0.4)
+        ],
+        "motor strength": [(f"x {v:g}", {"strength": (v, v)}) for v in (0.9, 0.7, 0.5)],
+        "joint friction": [(f"{v:g} N m", {"joint_friction": (v, v)}) for v in (0.2, 0.5, 1.0)],
+        "armature": [(f"x {v:g}", {"armature": (v, v)}) for v in (1.05, 1.2, 1.5)],
+        "encoder bias": [(f"±{v:g} rad", {"encoder_bias": v}) for v in (0.015, 0.03, 0.06)],
+        "observation noise": [
+            (f"{x:g} x mjlab", {name: x * most for name, most in NOISE.items()}) for x in (0.5, 1, 2)
+        ],
+        "slope": [(f"to {v:g} rad", {"slope": v}) for v in (0.03, 0.06, 0.12)],
+    }
+    pushed = {"push_interval": (EVERY, EVERY)}
+    found = [Case("none", "", DisturbanceConfig())]
+    for name, sizes in alone.items():
+        found += [
+            Case(name, size, DisturbanceConfig(**(pushed if "push" in name else {}) | changes))
+            for size, changes in sizes
+        ]
+    peers = dataclasses.replace(
+        MJLAB,
+        torso_mass=(-1.0, 3.0),
+        stiffness=(0.9, 1.1),
+        damping=(0.9, 1.1),
+        joint_friction=(0.05, 0.2),
+        armature=(1.0, 1.05),
+        delay=(0, substeps),
+    )
+    return [*found, Case("together", "mjlab's", MJLAB), Case("together", "all peers'", peers)]
+
+
+class _Second(NamedTuple):
+    """Episodes under way."""
+
+    now: EnvState
+    alive: jax.Array  # [N] bool
+    fell: jax.Array  # [N] bool
+    length: jax.Array  # [N] int32
+
+
+class Player:
+    """First episodes of a trainer's robot under any disturbances, by one program for all of them.
+
+    Args:
+      trainer: of the run.
+      episodes: per case.
+      seed: of starts and disturbances, which are the same for every policy.
+    """
+
+    def __init__(self, trainer: Trainer, episodes: int = EPISODES, seed: int = SEED):
+        self.trainer, self.count = trainer, episodes
+        config = trainer.config
+        # Whatever there may be is on; how large it is stands in the state.
+        everything = dataclasses.replace(
+            MJLAB, torso_mass=(0.0, 0.0), joint_friction=(0.0, 0.0), delay=(0, 2 * config.physics.substeps)
+        )
+        settings = dataclasses.replace(config.physics, impl="jax")
+        everything = dataclasses.replace(config, disturbance=everything, physics=settings)
+        backend = physics.make(trainer.robot, settings, joint_friction=True)
+        self.env = Env(trainer.robot, trainer.library, everything, backend)
+        self.noise = next(iter(episodes_of(config, episodes)))
+        self._key = jax.random.PRNGKey(seed)
+        rows = self.env.reset_rows(self._key, episodes)
+        self._start = self.env.start_at(rows, jax.random.fold_in(self._key, 2), jnp.full(episodes, self.noise))
+        self.chunk = round(config.control_rate)
+
+    def play(self, state: PPOState, config: DisturbanceConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Episodes under the mean action: ``qpos [T, N, 7 + J]``, lengths ``[N]`` in steps, and falls ``[N]``."""
+        disturbed = self.env.disturbances.init(jax.random.fold_in(self._key, 3), self.count, config)
+        disturbed = disturbed._replace(share=jnp.ones_like(disturbed.share))
+        alive = jnp.ones(self.count, bool)
+        under_way = _Second(self._start._replace(disturbed=disturbed), alive, ~alive, jnp.zeros(self.count, jnp.int32))
+        steps, courses = self.env.config.episode_steps, []
+        for i in range(-(-steps // self.chunk)):
+            under_way, qpos = self._second(state, under_way, jax.random.fold_in(self._key, 100 + i))
+            courses.append(np.asarray(qpos))
+            if not np.asarray(under_way.alive).any():
+                break
+        qpos = np.concatenate(courses)[:steps]
+        # An episode of the longest length may have ended within the last chunk, past its end.
+        length = np.minimum(np.asarray(under_way.length), steps)
+        fell = np.asarray(under_way.fell) & (np.asarray(under_way.length) <= steps)
+        return np.concatenate([qpos, np.repeat(qpos[-1:], steps - len(qpos), axis=0)]), length, fell
+
+    @partial(jax.jit, static_argnums=0)
+    def _second(self, state: PPOState, under_way: _Second, key: jax.Array):
+        env, policy = self.env, self.trainer.ppo.act(state, deterministic=True)
+
+        def step(carry, drawn):
+            now, seen = env.look(carry.now, drawn)
+            with self.trainer.precision():
+                action, _ = policy.act(of_actor(seen), None)
+            reached, alive = env.advance(now.physics, action, now.disturbed, drawn), carry.alive
+            now, going_on = now._replace(disturbed=reached.disturbed), alive & ~reached.fell
+            if env.command:  # it stays what it was at the start, and may end the episode
+                command, over, _ = env.command.advance(now.command, None, reached.observed.frame)
+                now, going_on = now._replace(command=command), going_on & ~over
+
+            def hold(new, old):
+                return jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+            sim = jax.tree.map(hold, reached.physics, now.physics)
+            observed = jax.tree.map(hold, reached.observed, now.observed)
+            after = _Second(
+                now._replace(physics=sim, observed=observed),
+                going_on,
+                carry.fell | (alive & reached.fell),
+                carry.length + alive,
+            )
+            return after, sim.qpos
+
+        return jax.lax.scan(step, under_way, env.disturbance_draws(key, self.chunk, self.count))
+
+
+def measure(trainer: Trainer, state: PPOState, *, episodes: int = EPISODES, note: Any = None) -> Robustness:
+    """Play the deterministic policy under every case and measure it.
+
+    Args:
+      trainer: of the run.
+      state: of the policy.
+      episodes: per case.
+      note: called with a line after each case; None for silence.
+
+    Raises:
+      UserError: the robot has no torso whose mass could differ.
+    """
+    player, cells = Player(trainer, episodes), []
+    for case in cases(trainer.config):
+        cells.append(_cell(trainer, case, *player.play(state, case.config)))
+        if note:
+            note(table(cells[-1:]))
+    speed = float(trainer.library.mean([planar_speed(clip) for clip in trainer.library.clips]))
+    return Robustness(tuple(cells), trainer.config.env.episode_steps / trainer.config.control_rate, speed)
+
+
+def _cell(trainer: Trainer, case: Case, qpos: np.ndarray, length: np.ndarray, fell: np.ndarray) -> Cell:
+    rate, robot = trainer.config.control_rate, trainer.robot
+    low, high = wilson(int(fell.sum()), len(fell))
+    speeds, _ = metrics.late_course(qpos[..., :3], rotations.yaw(qpos[..., 3:7].astype(np.float64)), length, rate=rate)
+    expert = trainer.library.mean(
+        [metrics.expert_ranges(clip.qpos[:, 7:], robot.sagittal_joints, rate=rate) for clip in trainer.library.clips]
+    )
+    ranges = metrics.window_ranges(qpos[..., 7:], length, robot.sagittal_joints, rate=rate)
+    speed, excursion = metrics.summarise(speeds), metrics.summarise(metrics.excursion(ranges, expert))
+    return Cell(
+        disturbance=case.disturbance,
+        size=case.size,
+        episodes=len(fell),
+        falls=int(fell.sum()),
+        low=low,
+        high=high,
+        seconds=float(length.mean()) / rate,
+        speed=speed.mean,
+        speed_n=speed.n,
+        excursion=excursion.mean,
+        excursion_n=excursion.n,
+    )
+
+
+def wilson(count: int, total: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share of which ``count`` of ``total`` were seen."""
+    share, z2 = count / total, Z**2 / total
+    middle, half = share + z2 / 2, Z * np.sqrt((share * (1 - share) + z2 / 4) / total)
+    return max(0.0, float((middle - half) / (1 + z2))), min(1.0, float((middle + half) / (1 + z2)))
+
+
+def table(cells: Any) -> str:
+    """Lines for people: falls with their interval, mean length, speed and excursion of each case."""
+    layout = "  {:<18} {:<12} {:>12} {:>14} {:>8} {:>10} {:>10}"
+    return tables.lines(layout, [_row(cell) for cell in cells])
+
+
+def heading() -> str:
+    """What stands above the columns of `table`."""
+    names = ("disturbance", "size", "falls", "95 %", "length", "speed", "excursion")
+    return tables.lines("  {:<18} {:<12} {:>12} {:>14} {:>8} {:>10} {:>10}", [names])
+
+
+def _row(cell: Cell) -> tuple[str, ...]:
+    def known(value: float, text: str) -> str:
+        return "undefined" if np.isnan(value) else text.format(value)
+
+    return (
+        cell.disturbance,
+        cell.size,
+        f"{cell.falls} of {cell.episodes}",
+        f"{100 * cell.low:.1f}-{100 * cell.high:.1f} %",
+        f"{cell.seconds:.1f} s",
+        known(cell.speed, "{:.2f} m/s"),
+        known(cell.excursion, "{:.2f}"),
+    )
+
+
+def bars(found: Robustness) -> list[tuple[str, list[tuple[str, float, float, float]]]]:
+    """The cells by disturbance, each with its size, share of falls and interval."""
+    groups: dict[str, list[tuple[str, float, float, float]]] = {}
+    for cell in found.cells:
+        share = cell.falls / cell.episodes
+        groups.setdefault(cell.disturbance, []).append((cell.size, share, cell.low, cell.high))
+    return list(groups.items())

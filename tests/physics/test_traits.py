@@ -1,0 +1,151 @@
+"""Robots and floors that differ from their model, against MuJoCo with a model that was changed by hand."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from fmpjax import physics, robots
+from fmpjax.config import preset
+from fmpjax.errors import UserError
+from fmpjax.physics import native, traits
+from fmpjax.physics.traits import Traits
+
+LAPTOP = dataclasses.replace(preset("laptop").physics, backend="native")
+COUNT = 4
+
+
+def nominal(robot, count=COUNT):
+    joints = robot.joint_count
+    ones, none = jnp.ones((count, joints)), jnp.zeros((count, joints))
+    one, zero = jnp.ones((count, 1)), jnp.zeros((count, 1))
+    return Traits(one, zero, jnp.zeros((count, 3)), ones, ones, ones, none, ones, jnp.zeros((count, 2)))
+
+
+def other(robot, count=COUNT):
+    """Robots that differ in everything, each in its own way."""
+    rng = np.random.default_rng(0)
+    shapes = traits.widths(robot.joint_count)
+    spans = Traits(
+        (0.3, 1.2), (-1, 3), (-0.05, 0.05), (0.8, 1.2), (0.8, 1.2), (0.7, 1), (0.1, 0.2), (1, 1.5), (-0.1, 0.1)
+    )
+    return Traits(*(jnp.asarray(rng.uniform(*s, (count, w)), jnp.float32) for s, w in zip(spans, shapes, strict=True)))
+
+
+@pytest.fixture(scope="module")
+def states(walk):
+    rng = np.random.default_rng(1)
+    rows = np.linspace(10, len(walk) - 1, COUNT).astype(int)
+    qpos, qvel = walk.qpos[rows].copy(), walk.qvel[rows].copy()
+    qpos[:, 2] -= 0.002  # pressed a little into the floor
+    targets = qpos[:, 7:] + 0.3 * rng.normal(size=qpos[:, 7:].shape)
+    return (*(jnp.asarray(x, jnp.float32) for x in (qpos, qvel)), jnp.asarray(targets, jnp.float32))
+
+
+def by_hand(robot, config, state, targets, own: Traits):
+    """One control step by MuJoCo's own loop, under ``targets [S, J]`` of each physics step, of a model changed here."""
+    model = native.model(robot, config)
+    torso = model.body("torso_link").id
+    floor = [i for i in range(model.ngeom) if model.geom(i).name == "floor" or "_foot_" in model.geom(i).name]
+    assert len(floor) > 2
+    model.geom_friction[floor, 0] *= float(own.friction[0])
+    mass = model.body_mass[torso]
+    model.body_mass[torso] += float(own.torso_mass[0])
+    model.body_inertia[torso] *= model.body_mass[torso] / mass
+    model.body_ipos[torso] += np.asarray(own.torso_center, np.float64)
+    model.body_sameframe[torso] = 0
+    model.actuator_gainprm[:, 0] *= own.stiffness
+    model.actuator_biasprm[:, 1] *= own.stiffness
+    model.actuator_biasprm[:, 2] *= own.damping
+    model.actuator_forcerange *= np.asarray(own.strength)[:, None]
+    model.jnt_actfrcrange[1:] *= np.asarray(own.strength)[:, None]
+    model.dof_frictionloss[6:] = own.joint_friction
+    model.dof_armature[6:] *= own.armature
+    x, y = np.sin(np.asarray(own.slope, np.float64))
+    model.opt.gravity[:] = -9.81 * np.array([x, y, 1.0]) / np.sqrt(x**2 + y**2 + 1.0)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = state
+    for target in targets:
+        data.ctrl[:] = target
+        mujoco.mj_step(model, data)
+    return data.qpos.copy(), data.qvel.copy()
+
+
+@pytest.mark.parametrize("name", [*Traits._fields, "all"])
+def test_a_trait_is_what_mujoco_makes_of_a_changed_model(robot, states, name):
+    qpos, qvel, targets = states
+    backend = physics.make(robot, LAPTOP)
+    plain = nominal(robot)
+    own = other(robot) if name == "all" else plain._replace(**{name: getattr(other(robot), name)})
+    start = physics.reset(qpos, qvel)
+    after = jax.jit(backend.step)(start, targets, own)
+    before = jax.jit(backend.step)(start, targets)
+    assert np.abs(np.asarray(after.qvel) - np.asarray(before.qvel)).max() > 1e-4, "the trait changes nothing"
+    for i in range(COUNT):
+        row = Traits(*(np.asarray(x)[i] for x in own))
+        found = by_hand(robot, LAPTOP, (qpos[i], qvel[i]), [targets[i]] * LAPTOP.substeps, row)
+        np.testing.assert_allclose(after.qpos[i], found[0], atol=2e-6)
+        np.testing.assert_allclose(after.qvel[i], found[1], rtol=1e-4, atol=1e-4)
+
+
+def test_the_models_own_traits_change_no_bit(robot, states):
+    qpos, qvel, targets = states
+    backend, start = physics.make(robot, LAPTOP), physics.reset(qpos, qvel)
+    plain = jax.jit(backend.step)(start, targets)
+    for held in (targets, jnp.repeat(targets[:, None], LAPTOP.substeps, axis=1)):
+        own = jax.jit(backend.step)(start, held, nominal(robot))
+        for a, b in zip(plain, own, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_targets_of_each_physics_step(robot, states):
+    qpos, qvel, targets = states
+    backend = physics.make(robot, LAPTOP)
+    several = jnp.stack([targets, targets + 0.2], axis=1)
+    after = jax.jit(backend.step)(physics.reset(qpos, qvel), several)
+    own = Traits(*(np.asarray(x)[0] for x in nominal(robot)))
+    for i in range(COUNT):
+        found = by_hand(robot, LAPTOP, (qpos[i], qvel[i]), several[i], own)
+        np.testing.assert_allclose(after.qvel[i], found[1], rtol=1e-4, atol=1e-4)
+
+
+def test_traits_of_batches_of_batches(robot, states):
+    qpos, qvel, targets = states
+    backend, own = physics.make(robot, LAPTOP), other(robot)
+    start = physics.reset(qpos, qvel)
+    together = jax.jit(backend.step)(start, targets, own)
+    pairs = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), (start, targets, own))
+    apart = jax.jit(jax.vmap(backend.step))(*pairs)
+    for a, b in zip(together, apart, strict=True):
+        np.testing.assert_array_equal(a, np.reshape(b, a.shape))
+
+
+@pytest.mark.slow
+def test_mjx_agrees_on_traits(robot, states):
+    qpos, qvel, targets = states
+    own = other(robot)
+    config = dataclasses.replace(LAPTOP, iterations=50, ls_iterations=50)
+    start = physics.reset(qpos, qvel)
+    several = jnp.stack([targets, targets + 0.1], axis=1)
+    native_step = physics.make(robot, config)
+    mjx_step = physics.make(robot, dataclasses.replace(config, backend="mjx"), joint_friction=True)
+    a, b = (jax.jit(backend.step)(start, several, own) for backend in (native_step, mjx_step))
+    np.testing.assert_allclose(a.qpos, b.qpos, atol=2e-4)
+    np.testing.assert_allclose(a.qvel, b.qvel, atol=2e-2)
+
+
+def test_a_robot_without_a_torso_is_refused(robot):
+    nameless = dataclasses.replace(robot, landmarks={})
+    with pytest.raises(UserError, match=r"robot unitree_g1 has no chest among the \[landmarks\] of its robot.toml"):
+        traits.torso_body(nameless)
+    assert traits.torso_body(robots.load("unitree_g1_29dof")) >= 0
+
+
+def test_gravity_above_a_slope(robot):
+    np.testing.assert_allclose(traits.gravity(jnp.zeros((1, 2))), [[0, 0, -1]])
+    down = np.asarray(traits.gravity(jnp.array([[0.1, 0.0]])))[0]
+    np.testing.assert_allclose(np.linalg.norm(down), 1.0, rtol=1e-6)
+    assert down[0] < 0 and np.arcsin(-down[0]) == pytest.approx(0.1, abs=1e-3)  # uphill is ahead

@@ -1,0 +1,368 @@
+"""Disturbances in closed form: pushes, late actions, sensors that err, what is drawn, and what the networks see."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fmpjax import disturbances, features, motion, physics, robots
+from fmpjax.acting import Policy, Seen
+from fmpjax.actions import action_map
+from fmpjax.config import DisturbanceConfig, preset
+from fmpjax.env import Env
+from fmpjax.errors import UserError
+from tests.helpers import tiny
+
+COUNT = 6
+
+
+def built(robot, walk, told=0, **changes):
+    config = preset("laptop", **changes)
+    return disturbances.make(config, robot, action_map(robot, walk, "residual"), told)
+
+
+def states(robot, count=COUNT):
+    qpos = np.tile(robot.default_qpos, (count, 1))
+    qpos[:, 3:7] = [np.cos(0.2), 0.0, np.sin(0.2), 0.0]  # pitched by 0.4 rad
+    qvel = np.random.default_rng(0).normal(size=(count, 6 + robot.joint_count))
+    return physics.reset(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
+
+
+# --- what is asked for -----------------------------------------------------------------------------------------------
+
+
+def test_presets_without_disturbances_have_none(robot, walk):
+    for name in ("smoke", "laptop", "paper"):
+        config = preset(name)
+        assert disturbances.make(config, robot, action_map(robot, walk, "residual"), 0) is None
+        assert not config.disturbance.any
+    assert preset("robust").disturbance.any and preset("robot").command.kind == "velocity"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("friction", "1.2,0.3", "friction is 1.2, 0.3: expected two numbers, the lower one first, or none"),
+        ("friction", "0,1", "friction is 0, 1: expected numbers above 0"),
+        ("torso_mass", "1", "torso_mass is 1: expected two numbers, the lower one first, or none"),
+        ("damping", "-0.1,1", "damping is -0.1, 1: expected numbers of at least 0"),
+        ("torso_center", "0.1", "torso_center is 0.1: expected three numbers, along x, y and z, or none"),
+        ("slope", "0.6", "slope is 0.6: expected at most 0.5 rad"),
+        ("delay", "4,0", "delay is 4, 0: expected two numbers, the lower one first, or none"),
+        ("push_interval", "0,1", "push_interval is 0, 1: expected numbers above 0"),
+    ],
+)
+def test_ranges_out_of_order_or_of_physics_are_refused(key, value, said):
+    with pytest.raises(UserError, match=f"setting disturbance.{said}"):
+        preset("laptop", **{f"disturbance.{key}": value})
+
+
+def test_pushes_without_a_speed_are_refused():
+    with pytest.raises(UserError, match="push_speed is empty and push_interval is not"):
+        preset("laptop", **{"disturbance.push_speed": "", "disturbance.push_interval": "1,2"})
+
+
+def test_a_history_of_what_has_none_is_refused():
+    with pytest.raises(UserError, match="observation_history is 3 and env.observation 'compact': expected 1"):
+        preset("laptop", **{"env.observation_history": 3})
+
+
+def test_a_torso_of_no_mass_is_refused(robot, walk):
+    with pytest.raises(UserError, match=r"torso_mass begins with -50: expected more than -[\d.]+ kg, since the torso"):
+        built(robot, walk, **{"disturbance.torso_mass": (-50.0, 0.0)})
+
+
+# --- what is drawn ---------------------------------------------------------------------------------------------------
+
+
+def test_robots_and_floors_are_drawn_from_their_ranges(robot, walk):
+    ranges = {
+        "friction": (0.3, 1.2),
+        "torso_mass": (-1.0, 3.0),
+        "stiffness": (0.9, 1.1),
+        "damping": (0.8, 1.2),
+        "strength": (0.5, 1.0),
+        "joint_friction": (0.1, 0.2),
+        "armature": (1.0, 1.05),
+    }
+    more = {"torso_center": (0.01, 0.02, 0.03), "slope": 0.1, "encoder_bias": 0.015}
+    made = built(robot, walk, **{f"disturbance.{k}": v for k, v in (ranges | more).items()})
+    state = made.init(jax.random.PRNGKey(0), 2000)
+    for name, (low, high) in ranges.items():
+        found, span = np.asarray(getattr(state.body, name)), high - low
+        assert low <= found.min() < low + 0.01 * span and high - 0.01 * span < found.max() <= high + 1e-6, name
+    off = np.abs(np.asarray(state.body.torso_center))
+    np.testing.assert_allclose(off.max(0), [0.01, 0.02, 0.03], rtol=0.02)
+    steep = np.linalg.norm(state.body.slope, axis=-1)
+    assert 0.099 < steep.max() <= 0.1 and abs(np.asarray(state.body.slope).mean()) < 0.005
+    assert 0.0149 < np.abs(state.bias).max() <= 0.015
+    again = made.init(jax.random.PRNGKey(0), 2000)
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(again), strict=True))
+
+
+def test_what_is_not_asked_for_stays_the_robots_own(robot, walk):
+    made = built(robot, walk, **{"disturbance.friction": (0.5, 0.5), "physics.frictionloss": 0.2})
+    body = made.init(jax.random.PRNGKey(0), 3).body
+    for name, value in {"friction": 0.5, "torso_mass": 0, "stiffness": 1, "joint_friction": 0.2, "slope": 0}.items():
+        np.testing.assert_array_equal(getattr(body, name), np.full_like(getattr(body, name), value))
+
+
+def test_delays_are_drawn_for_each_episode(robot, walk):
+    made = built(robot, walk, **{"disturbance.delay": (1, 4)})
+    state = made.init(jax.random.PRNGKey(0), 1000)
+    counts = np.bincount(state.episode.delay, minlength=6)
+    assert counts[0] == counts[5] == 0 and counts[1:5].min() > 200
+    other = made.begin(state.sizes, made.draw(jax.random.PRNGKey(1), (1000,)))
+    assert (other.delay != state.episode.delay).mean() > 0.6
+
+
+# --- pushes ----------------------------------------------------------------------------------------------------------
+
+PUSHED = {"disturbance.push_interval": (0.1, 0.1), "disturbance.push_speed": (0.5, 0.5)}
+
+
+def test_a_push_adds_its_velocity_and_comes_when_it_is_due(robot, walk):
+    made = built(robot, walk, **PUSHED)
+    state, sim = made.init(jax.random.PRNGKey(0), COUNT), states(robot)
+    state = state._replace(episode=state.episode._replace(wait=jnp.arange(COUNT) % 5 + 1))
+    drawn, action = made.draw(jax.random.PRNGKey(1), (COUNT,)), jnp.zeros((COUNT, robot.joint_count))
+    (pushed, targets), after = made.act(state, sim, action, drawn)
+    added, due = np.asarray(pushed.qvel - sim.qvel), np.asarray(state.episode.wait) == 1
+    angle = 2 * np.pi * np.asarray(drawn)[:, 0]
+    expected = 0.5 * np.stack([np.cos(angle), np.sin(angle)], axis=1) * due[:, None]
+    np.testing.assert_allclose(added[:, :2], expected, atol=1e-6)
+    assert not added[:, 2:].any() and due.sum() == 2
+    np.testing.assert_array_equal(after.episode.wait, np.where(due, 5, np.asarray(state.episode.wait) - 1))
+    np.testing.assert_allclose(targets, made.actions(action))
+    np.testing.assert_array_equal(pushed.qpos, sim.qpos)
+
+
+def test_a_push_lifts_and_turns_within_its_sizes(robot, walk):
+    sizes = {"push_lift": 0.4, "push_tilt": 0.52, "push_turn": 0.78}
+    made = built(robot, walk, **PUSHED, **{f"disturbance.{k}": v for k, v in sizes.items()})
+    state, sim = made.init(jax.random.PRNGKey(0), 3000), states(robot, 3000)
+    state = state._replace(episode=state.episode._replace(wait=jnp.ones(3000, int)), share=jnp.full(3000, 0.5))
+    drawn = made.draw(jax.random.PRNGKey(1), (3000,))
+    (pushed, _), _ = made.act(state, sim, jnp.zeros((3000, robot.joint_count)), drawn)
+    added = np.asarray(pushed.qvel - sim.qvel)
+    np.testing.assert_allclose(np.linalg.norm(added[:, :2], axis=1), 0.25, atol=1e-6)  # half of the size
+    np.testing.assert_allclose(np.abs(added[:, 2:6]).max(0), [0.2, 0.26, 0.26, 0.39], rtol=0.01)
+    assert not added[:, 6:].any() and np.abs(added[:, :6].mean(0)).max() < 0.02
+
+
+def test_pushes_grow_while_episodes_survive(robot, walk):
+    made = built(robot, walk, **PUSHED, **{"disturbance.push_start": 0.3, "disturbance.push_growth": 0.1})
+    state = made.init(jax.random.PRNGKey(0), 2)
+    np.testing.assert_allclose(state.share, 0.3)
+    for surviving, expected in ((0.9, 0.4), (0.9, 0.5), (0.1, 0.4), (0.1, 0.3), (0.1, 0.3)):
+        state = made.grow(state, jnp.float32(surviving), 0.75)
+        np.testing.assert_allclose(state.share, expected, rtol=1e-6)
+    for _ in range(9):
+        state = made.grow(state, jnp.float32(0.9), 0.75)
+    np.testing.assert_array_equal(state.share, 1.0)
+
+
+# --- late actions ----------------------------------------------------------------------------------------------------
+
+
+def test_late_actions_reach_each_physics_step_when_they_should(robot, walk):
+    delay, substeps, steps = 5, 2, 6
+    made = built(robot, walk, **{"disturbance.delay": (0, delay)})
+    count, joints = delay + 1, robot.joint_count
+    state, sim = made.init(jax.random.PRNGKey(0), count), states(robot, count)
+    state = state._replace(episode=state.episode._replace(delay=jnp.arange(count)))
+    actions = np.random.default_rng(0).uniform(-0.5, 0.5, (steps, joints)).astype(np.float32)
+    seen = []
+    for action in actions:
+        (_, targets), state = made.act(
+            state, sim, jnp.tile(action, (count, 1)), made.draw(jax.random.PRNGKey(0), (count,))
+        )
+        seen.append(np.asarray(targets))
+    seen = np.concatenate(seen, axis=1)  # [count, steps * substeps, J]
+    told = np.repeat(actions, substeps, axis=0)
+    for late in range(count):
+        expected = np.concatenate([np.zeros((late, joints)), told])[: steps * substeps]
+        np.testing.assert_allclose(seen[late], made.actions(jnp.asarray(expected, jnp.float32)), atol=1e-6)
+    np.testing.assert_allclose(state.episode.sent[0, -1], actions[-1])
+
+
+def test_the_last_action_is_within_its_limits(robot, walk):
+    made = built(robot, walk, **{"env.observation": "deployable"})
+    state, sim = made.init(jax.random.PRNGKey(0), 2), states(robot, 2)
+    action = jnp.full((2, robot.joint_count), 1e3)
+    (_, targets), state = made.act(state, sim, action, made.draw(jax.random.PRNGKey(0), (2,)))
+    np.testing.assert_allclose(targets[0], robot.joint_high + 0.3, rtol=1e-6)
+    np.testing.assert_allclose(made.actions(state.episode.sent[:, -1]), targets, atol=1e-5)
+    assert np.abs(state.episode.sent).max() < 100
+
+
+# --- sensors ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_deployable_observation_is_what_a_robot_senses(robot, walk):
+    made = built(robot, walk, told=3, **{"env.observation": "deployable", "command.kind": "velocity"})
+    state, sim = made.init(jax.random.PRNGKey(0), COUNT), states(robot)
+    told = jnp.asarray(np.random.default_rng(2).normal(size=(COUNT, 3)), jnp.float32)
+    seen, after = made.sense(state, sim, told, made.draw(jax.random.PRNGKey(0), (COUNT,)))
+    terms = features.observation_terms(robot, "deployable velocity")
+    assert list(terms) == [
+        "base_ang_vel", "projected_gravity", "velocity_commands", "joint_pos_rel", "joint_vel_rel", "last_action",
+    ]  # fmt: skip
+    assert seen.shape == (COUNT, sum(terms.values())) == (COUNT, 96)
+    parts = dict(zip(terms, np.split(np.asarray(seen), np.cumsum(list(terms.values()))[:-1], axis=1), strict=True))
+    np.testing.assert_allclose(parts["base_ang_vel"], sim.qvel[:, 3:6])
+    np.testing.assert_allclose(
+        parts["projected_gravity"], np.tile([np.sin(0.4), 0, -np.cos(0.4)], (COUNT, 1)), atol=1e-6
+    )
+    np.testing.assert_allclose(parts["velocity_commands"], told)
+    np.testing.assert_allclose(parts["joint_pos_rel"], sim.qpos[:, 7:] - made.actions.center, atol=1e-6)
+    np.testing.assert_allclose(parts["joint_vel_rel"], sim.qvel[:, 6:])
+    assert not parts["last_action"].any()
+    assert features.observation_form(preset("robust")) == "deployable"
+    assert (
+        features.observation_form(preset("robot", **{"env.observation_history": 4})) == "deployable velocity history-4"
+    )
+
+
+def test_noise_and_bias_are_within_their_sizes_and_the_state_stays_true(robot, walk):
+    noise = {"turn_noise": 0.2, "tilt_noise": 0.05, "angle_noise": 0.01, "velocity_noise": 1.5}
+    count, joints = 4000, robot.joint_count
+    made = built(robot, walk, **{"env.observation": "deployable"}, **{f"disturbance.{k}": v for k, v in noise.items()})
+    plain = built(robot, walk, **{"env.observation": "deployable"})
+    state, sim = made.init(jax.random.PRNGKey(0), count), states(robot, count)
+    seen, _ = made.sense(state, sim, (), made.draw(jax.random.PRNGKey(1), (count,)))
+    true, _ = plain.sense(
+        plain.init(jax.random.PRNGKey(0), count), sim, (), plain.draw(jax.random.PRNGKey(1), (count,))
+    )
+    off = np.asarray(seen - true)
+    most = np.abs(off).max(0)
+    np.testing.assert_allclose(most[:3], 0.2, rtol=0.02)
+    assert 0.04 < most[3:6].max() <= 0.05 * np.sqrt(2)
+    np.testing.assert_allclose(most[6 : 6 + joints], 0.01, rtol=0.02)
+    np.testing.assert_allclose(most[6 + joints : 6 + 2 * joints], 1.5, rtol=0.02)
+    assert not off[:, 6 + 2 * joints :].any() and np.abs(off[:, :6].mean(0)).max() < 0.01
+    np.testing.assert_allclose(np.linalg.norm(np.asarray(seen)[:, 3:6], axis=1), 1.0, rtol=1e-5)
+
+
+def test_an_encoder_that_is_off_is_off_for_the_servo_and_the_actor(robot, walk):
+    made = built(robot, walk, **{"disturbance.encoder_bias": 0.1, "env.observation": "deployable"})
+    state, sim = made.init(jax.random.PRNGKey(0), COUNT), states(robot)
+    drawn, joints = made.draw(jax.random.PRNGKey(1), (COUNT,)), robot.joint_count
+    seen, _ = made.sense(state, sim, (), drawn)
+    np.testing.assert_allclose(seen[:, 6 : 6 + joints], sim.qpos[:, 7:] + state.bias - made.actions.center, atol=1e-6)
+    # A servo that has reached its target by its encoder is off by the bias.
+    (_, targets), _ = made.act(state, sim, jnp.zeros((COUNT, joints)), drawn)
+    np.testing.assert_allclose(targets + state.bias, made.actions(jnp.zeros((COUNT, joints))), atol=1e-6)
+
+
+def test_any_observation_can_err(robot, walk):
+    made = built(robot, walk, **{"disturbance.angle_noise": 0.01, "disturbance.velocity_noise": 1.0})
+    state, sim = made.init(jax.random.PRNGKey(0), COUNT), states(robot)
+    seen, _ = made.sense(state, sim, (), made.draw(jax.random.PRNGKey(1), (COUNT,)))
+    true = features.observe(robot, sim.qpos, sim.qvel, "compact").actor
+    off = np.abs(np.asarray(seen - true))
+    joints = slice(13, 13 + robot.joint_count)
+    assert seen.shape == true.shape and not off[:, :13].max() > 1e-5
+    assert 0 < off[:, joints].max() <= 0.01 + 1e-6
+
+
+def test_a_history_holds_each_terms_steps_oldest_first(robot, walk):
+    made = built(robot, walk, **{"env.observation": "deployable", "env.observation_history": 3})
+    state, sim = made.init(jax.random.PRNGKey(0), COUNT), states(robot)
+    drawn, joints = made.draw(jax.random.PRNGKey(1), (COUNT,)), robot.joint_count
+    turns = []
+    for step in range(4):
+        moved = sim._replace(qvel=sim.qvel + step)
+        seen, state = made.sense(state, moved, (), drawn)
+        turns.append(np.asarray(moved.qvel[:, 3:6]))
+        expected = np.concatenate([turns[max(0, step + past)] for past in (-2, -1, 0)], axis=1)
+        np.testing.assert_allclose(seen[:, :9], expected)
+    assert seen.shape[1] == 3 * (6 + 3 * joints) == sum(features.observation_terms(robot, made.form).values())
+    np.testing.assert_allclose(seen[:, -joints:], 0)
+
+
+# --- in the environment ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def played():
+    """Two rollouts of the `robot` preset's disturbances, faster than usual, and the environment before and after."""
+    config, one = tiny(**preset_changes()), robots.load("unitree_g1")
+    env = Env(one, motion.load("walk"), config, physics.make(one, config.physics))
+    joints = one.joint_count
+
+    def act(observation, key):
+        return 0.3 * jax.random.normal(key, (len(observation), joints)), {"saw": observation}
+
+    roll = jax.jit(lambda state, key: env.rollout(state, Policy(act), key, 8))
+    start = env.reset(jax.random.PRNGKey(0))
+    middle, first = roll(start, jax.random.PRNGKey(1))
+    end, second = roll(middle, jax.random.PRNGKey(2))
+    return env, (start, middle, end), (first, second), roll
+
+
+def preset_changes():
+    own = dataclasses.asdict(preset("robot").disturbance)
+    changes = {f"disturbance.{name}": value for name, value in own.items()}
+    changes |= {"disturbance.push_interval": (0.04, 0.1), "env.observation": "deployable", "env.observation_history": 2}
+    return changes | {"command.kind": "velocity", "env.axes": "heading", "features.axes": "heading", "env.first_cap": 5}
+
+
+def test_the_actor_sees_sensors_and_the_critic_the_truth(played):
+    env, (start, *_), (first, second), _ = played
+    assert isinstance(first.observation, Seen)
+    sizes = env.observation_size
+    assert sizes.actor == first.observation.actor.shape[-1] == 2 * 96
+    # Compact observation, command, its errors, two actions on their way, their delay, robot and floor.
+    assert sizes.critic == first.observation.critic.shape[-1] == 86 + 3 + 3 + 2 * 29 + 1 + 7
+    assert first.next_observation.shape[-1] == sizes.critic
+    np.testing.assert_array_equal(first.extras["saw"], first.observation.actor)
+    clip = env.clip_observations
+    assert (clip.actor.shape, clip.critic.shape) == ((env.clip_rows, sizes.actor), (env.clip_rows, sizes.critic))
+    # What the critic sees next is what it then sees, where no episode ended.
+    on = ~np.asarray(first.fell | first.timed_out)[:-1]
+    np.testing.assert_allclose(
+        np.asarray(first.next_observation)[:-1][on], np.asarray(first.observation.critic)[1:][on], atol=1e-5
+    )
+    assert on.any()
+
+
+def test_robots_stay_the_same_and_episodes_do_not(played):
+    _, (start, middle, end), (first, _), _ = played
+    for a, b in zip(jax.tree.leaves(start.disturbed.body), jax.tree.leaves(end.disturbed.body), strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(start.disturbed.bias, end.disturbed.bias)
+    ended = np.asarray(first.fell | first.timed_out)
+    assert ended.any()
+    # The first action of an episode is preceded by none.
+    again = ended[:-1]
+    last = np.asarray(first.observation.actor)[1:][again][:, -29:]
+    assert again.any() and not last.any()
+
+
+def test_a_rollout_is_a_function_of_its_state(played):
+    _, (_, middle, end), (_, second), roll = played
+    kept = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), middle)
+    again, record = roll(kept, jax.random.PRNGKey(2))
+    for a, b in zip(jax.tree.leaves((end, second)), jax.tree.leaves((again, record)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_prior_sees_the_true_state(played):
+    env, (_, _, end), (_, second), _ = played
+    alive = ~np.asarray(second.fell | second.timed_out)[-1]
+    true = features.observe(env.robot, end.physics.qpos, end.physics.qvel, "compact").frame
+    np.testing.assert_allclose(np.asarray(second.frame)[-1][alive], np.asarray(true)[alive], atol=1e-5)
+    assert alive.any()
+
+
+def test_an_undisturbed_start_is_the_models_own(played):
+    env, (start, *_), _, _ = played
+    calm = env.undisturbed(start).disturbed
+    assert not np.asarray(calm.bias).any() and not np.asarray(calm.sizes.noise).any()
+    assert (np.asarray(calm.body.friction) == 1).all() and not np.asarray(calm.episode.delay).any()
+    assert np.asarray(calm.episode.wait).min() > 100
+    assert jax.tree.structure(calm) == jax.tree.structure(start.disturbed)
+    assert DisturbanceConfig() == preset("laptop").disturbance

@@ -1,0 +1,89 @@
+"""The evaluation under disturbances: its cases, its intervals, what it plays, and the command."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fmpjax import cli, robustness, runs
+from fmpjax.config import Config, DisturbanceConfig, preset
+from fmpjax.trainer import Trainer
+from fmpjax.viz import bars
+from tests.helpers import tiny
+
+
+def test_intervals_are_wilsons():
+    # By Wilson's formula, computed by hand for 10 of 100 with z = 1.96.
+    np.testing.assert_allclose(robustness.wilson(10, 100), (0.0552, 0.1744), atol=1e-4)
+    low, high = robustness.wilson(0, 256)
+    assert low == 0 and high == pytest.approx(1.959964**2 / (256 + 1.959964**2))
+    assert robustness.wilson(256, 256)[1] == 1.0
+
+
+def test_each_disturbance_is_alone_at_three_sizes_and_all_are_together():
+    found = robustness.cases(preset("laptop"))
+    names = [case.disturbance for case in found]
+    assert names[0] == "none" and found[0].config == DisturbanceConfig() and names[-2:] == ["together"] * 2
+    alone = set(names) - {"none", "together"}
+    assert all(names.count(name) == 3 for name in alone) and len(alone) == 13
+    delays = [case for case in found if case.disturbance == "delay"]
+    assert [case.size for case in delays] == ["10 ms", "20 ms", "40 ms"]
+    assert [case.config.delay for case in delays] == [(1, 1), (2, 2), (4, 4)]
+    for case in found:
+        case.config.check()
+    # The paper's physics has four physics steps of 5 ms per control step.
+    paper = [case.size for case in robustness.cases(Config()) if case.disturbance == "delay"]
+    assert paper == ["10 ms", "20 ms", "40 ms"]
+    assert robustness.cases(preset("laptop"))[-2].config == robustness.MJLAB
+
+
+def test_a_picture_of_the_cells(tmp_path):
+    cell = robustness.Cell("push", "1 m/s", 4, 1, 0.05, 0.7, 3.0, 0.8, 3, 1.0, 3)
+    none = cell._replace(disturbance="none", size="", falls=0, low=0.0, speed=float("nan"))
+    found = robustness.Robustness((none, cell), 10.0, 0.8)
+    groups = robustness.bars(found)
+    assert groups == [("none", [("", 0.0, 0.0, 0.7)]), ("push", [("1 m/s", 0.25, 0.05, 0.7)])]
+    assert bars.draw(tmp_path / "robustness.png", groups, "a run").stat().st_size > 5000
+    assert json.loads(found.to_json())["cells"][0]["speed"] is None
+    text = robustness.table(found.cells)
+    assert "1 of 4" in text and "undefined" in text and "5.0-70.0 %" in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["laptop", "robot"])
+def test_any_policy_is_played_under_any_disturbance(walk, name):
+    changes = {} if name == "laptop" else {"env.observation": "deployable", "command.kind": "velocity"}
+    trainer = Trainer(tiny(**changes), walk)
+    player = robustness.Player(trainer, 6)
+    state = trainer.init(0).ppo
+    calm = player.play(state, DisturbanceConfig())
+    steps = trainer.config.env.episode_steps
+    assert calm[0].shape == (steps, 6, 7 + trainer.robot.joint_count)
+    assert (calm[1] <= steps).all() and (calm[2] <= (calm[1] <= steps)).all()
+    again = player.play(state, DisturbanceConfig())
+    for a, b in zip(calm, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    for case in robustness.cases(trainer.config)[1::3]:
+        qpos, *_ = player.play(state, case.config)
+        assert np.abs(qpos - calm[0]).max() > 1e-6, case
+    assert player._second._cache_size() == 1, "one program serves all cases"
+
+
+@pytest.mark.slow
+def test_the_command_writes_figures_and_a_picture(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(robustness, "cases", lambda config: robustness_cases(config)[:2])
+    run = runs.Run.create(tmp_path / "run", tiny())
+    runs.train(run)
+    cli.main(["evaluate", str(run.folder), "--robust", "--episodes", "4"])
+    figures = json.loads((run.folder / "robustness.json").read_text())
+    assert [cell["disturbance"] for cell in figures["cells"]] == ["none", "push"]
+    assert (run.folder / "robustness.png").exists() and "0.25 m/s" in capsys.readouterr().out
+
+
+robustness_cases = robustness.cases
+
+
+def test_two_evaluations_at_once_are_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["evaluate", str(tmp_path), "--robust", "--commands"])
+    assert "--commands and --robust are two evaluations: expected one of them" in capsys.readouterr().err
