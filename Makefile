@@ -38,7 +38,10 @@ unknown := $(firstword $(filter-out $(known),$(given)))
 ifneq ($(unknown),)
   close := $(shell for python in $(BIN)/python python3; do "$$python" -c 'import difflib, sys; \
     print(*difflib.get_close_matches(sys.argv[1].upper(), sys.argv[2:], 1))' '$(unknown)' $(known) 2>/dev/null && break; done)
-  $(error unknown variable $(unknown)$(if $(close),$(comma) perhaps $(close)): make $(goals) takes $(strip $(known)))
+  # What programs read from the environment belongs before `make`.
+  hint := $(if $(filter JAX_% XLA_% CUDA_% MUJOCO_% FMPJAX_% PYTHON%,$(unknown)),; as an environment variable it stands before\
+    make: $(unknown)=... make $(goals))
+  $(error unknown variable $(unknown)$(if $(close),$(comma) perhaps $(close)): make $(goals) takes $(strip $(known))$(hint))
 endif
 
 .PHONY: train evaluate render test test-fast coverage check format build clean help run-is-named

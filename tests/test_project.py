@@ -86,6 +86,10 @@ def _make(*arguments: str) -> subprocess.CompletedProcess:
         (("train", "OPTIMIZER=adam"), r"OPTIMIZER: make train takes .*"),
         (("evaluate", "RUN=a", "PRESET=smoke"), r"PRESET: make evaluate takes RUN ARGS .*"),
         (("PRESET=smoke",), r"PRESET: make help takes .*"),
+        (
+            ("train", "JAX_PLATFORMS=cpu"),
+            r"JAX_PLATFORMS: .*; as an environment variable it stands before make: JAX_PLATFORMS=\.\.\. make train",
+        ),
         *(((target, "XYZ=1"), rf"XYZ: make {target} takes .*")
           for target in ("render", "test", "test-fast", "coverage", "check", "format", "build", "clean", "help")),
     ],
