@@ -1,4 +1,8 @@
-"""What the tests share. ``FMPJAX_TEST_DATA`` may name a folder with data that is not shipped; tests pass without it."""
+"""What the tests share.
+
+``FMPJAX_TEST_DATA`` may name a folder with data that is not shipped; tests pass without it. ``FMPJAX_TEST_SHAPES=0``
+leaves out the checks of the shapes that functions state.
+"""
 
 import os
 import tempfile
@@ -16,9 +20,18 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 # A device that waits for the others holds one of the threads of XLA, which makes one a core: too few are a deadlock.
 os.environ.setdefault("NPROC", str(2 * max(os.cpu_count() or 1, 4)))
 
+import jaxtyping
 import pytest
 
-from fmpjax import motion, robots
+# Before the package is imported: each call of these modules' functions is checked against its annotations.
+CHECKED = [
+    f"fmpjax.{name}"
+    for name in ("features", "frames", "learning", "potential", "priors.base", "priors.flow", "rotations", "transport")
+]
+if os.environ.get("FMPJAX_TEST_SHAPES") != "0":
+    jaxtyping.install_import_hook(CHECKED, "beartype.beartype")
+
+from fmpjax import motion, robots  # noqa: E402
 
 
 @pytest.fixture(scope="session")
