@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fmpjax import config, features, motion, physics, robots
-from fmpjax.acting import Policy
+from fmpjax.acting import ActionRule
 from fmpjax.env import Env, EnvState
 from fmpjax.physics.native import NativePhysics
 
@@ -62,7 +62,7 @@ def ways(env: Env, start: EnvState, steps: int) -> dict[str, Callable[[], object
         return jnp.zeros((count, env.robot.joint_count)), {}
 
     def whole(state, key):
-        return env.rollout(state, Policy(constant), key, steps)
+        return env.rollout(state, ActionRule(constant), key, steps)
 
     callback, observed, whole = jax.jit(callback), jax.jit(observed), jax.jit(whole)
     return {

@@ -107,7 +107,7 @@ def parts(trainer, state, seeds: int) -> dict[str, Part]:
     import jax
 
     from fmpjax import priors
-    from fmpjax.trainer import _batch
+    from fmpjax.trainer import policy_batch
 
     env, ppo, prior = trainer.env, trainer.ppo, trainer.prior
     over = jax.vmap if seeds > 1 else lambda function: function
@@ -116,7 +116,7 @@ def parts(trainer, state, seeds: int) -> dict[str, Part]:
     look = over(lambda s, r: trainer.feature_map(env.frame_table(s.env, r)[r.window]))
     fit = over(lambda s, f, r, k: prior.update(s.prior, priors.Rollout(f, ~r.nonfinite, r.length == 1), k)[1])
     score = over(lambda s, f: prior.score(s.prior, f.reshape(-1, f.shape[-1])))
-    improve = over(lambda s, r, reward, k: ppo.update(s.ppo, _batch(r, reward), k)[0])
+    improve = over(lambda s, r, reward, k: ppo.update(s.ppo, policy_batch(r, reward), k)[0])
     made = {"physics": physics_alone(trainer, state), "rollout": part(play, state, keys)}
     record = made["rollout"].call()
     made["features"] = part(look, state, record)

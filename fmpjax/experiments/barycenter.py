@@ -31,7 +31,7 @@ from fmpjax.viz.panels import Line, Panel
 NAME = "barycenter"
 RESETS = ("dataset", "fixed")
 TARGETS = 2048  # of the first rollout [P]
-REWARD_TOLERANCE = 1e-6  # within which rewards made anew must be the method's own
+REWARD_TOLERANCE = 1e-6  # to which recomputed rewards must equal the method's own
 _SPREAD = ("retention", "target_leg_velocity", "effective_atoms", "target_speed")  # figures with a deviation
 QUANTILES = np.linspace(0.0, 1.0, 41)
 COLOURS = {"dataset": "#2a6fb0", "fixed": "#c8553d"}
@@ -112,7 +112,7 @@ def _prior_at(trainer: Trainer, fraction: float) -> priors.MotionPrior:
 def _figures(
     trainer: Trainer, prior: BarycentricState, rollout: priors.Rollout, reward: jax.Array, targets: int, seed: int
 ) -> dict[str, Any]:
-    """Figures of one draw, all made anew in float64 from the windows and the prior's dual."""
+    """Figures of one draw, all recomputed in float64 from the windows and the prior's dual."""
     env, windows = trainer.env, rollout.features
     valid = np.flatnonzero(np.asarray(rollout.valid))
     chosen = np.random.default_rng(seed).choice(valid, targets, replace=False)
@@ -224,7 +224,7 @@ def verdicts(record: Mapping[str, Any]) -> list[Verdict]:
             all(f["target_speed"] > 0.8 * f["bank_speed"] for f in resets.values()),
         ),
         Verdict(
-            "Rewards made anew are the method's own",
+            "Recomputed rewards are the method's own",
             f"they differ by {largest:.1e} at most, their logarithms by {exponent:.1e}",
             largest <= REWARD_TOLERANCE,
         ),

@@ -27,7 +27,7 @@ from fmpjax.shell import default
 from fmpjax.trainer import Trainer
 
 FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the way from a rollout's window to an expert's [P]
-BLOCK = 128  # updates of one call, as many as the paper's of a rollout: the parameter average starts anew in each [P]
+BLOCK = 128  # updates of one call, as many as the paper's of a rollout: the parameter average restarts in each [P]
 GROUPS = "groups"  # the second reference group, measured like a prior
 
 QUERY_SHARE = 0.75  # environments that supply queries; the others are held out [P]
@@ -230,7 +230,7 @@ class _Played(NamedTuple):
     told: dict[str, Any]  # how far the policies were trained, their speeds and the cohorts' sizes
 
 
-def _play(run: Path, walking: Path, size: Size, keys: Sequence[jax.Array]) -> tuple[Trainer, _Played]:
+def _play(run: Path, walking: Path, size: Size, keys: jax.Array) -> tuple[Trainer, _Played]:
     """The standing run's parts, and the windows that both policies execute."""
     trainer, state = histories.policy(run, best=False)
     walker, walker_state = histories.policy(walking, best=True)
@@ -249,7 +249,7 @@ def _play(run: Path, walking: Path, size: Size, keys: Sequence[jax.Array]) -> tu
 
 
 def _measure(
-    trainer: Trainer, played: _Played, fits: Mapping[str, Fit], size: Size, keys: Sequence[jax.Array]
+    trainer: Trainer, played: _Played, fits: Mapping[str, Fit], size: Size, keys: jax.Array
 ) -> tuple[dict[str, dict[str, Any]], float]:
     """Figures of every fit and of the second reference group, by name; and the time of both references, s."""
     config, dimension = trainer.config.prior, trainer.feature_map.dimension
