@@ -1,7 +1,7 @@
 """What does each learned reward cost beside the rollout and PPO?
 
-Rollout, windows and PPO are the same for every method and timed once a round; fitting and scoring are timed for each
-in turn, on the same rollout. Overhead is the reward's time over everything else's.
+Rollout, windows and PPO are the same for every method and timed once per round. Fitting and scoring are timed for each
+method in turn, on the same rollout. Overhead is the reward's time over everything else's.
 """
 
 import argparse
