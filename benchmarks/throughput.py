@@ -1,10 +1,10 @@
 """How many transitions per second does training make, where does the time go, and what is the least it could take?
 
-A case is a number of environments, of seeds and of devices. It is the whole program as a run calls it, iterations scanned
-and compiled. On a CPU all cases are timed in turn, round after round, so that a noisy machine disturbs them alike. On an
-accelerator, whose memory they would share, they run one after the other, and the table is written after each. The parts of
-a case are compiled one by one and timed on the state that it reached: physics alone (on a CPU `mujoco.rollout`
-without JAX), the rest of the rollout, features, fitting, scoring, PPO.
+A case is a number of environments, of seeds and of devices. It is the whole program as a run calls it, iterations
+scanned and compiled. On a CPU all cases are timed in turn, round after round, so that a noisy machine disturbs them
+alike. On an accelerator, whose memory they would share, they run one after the other, and the table is written after
+each. The parts of a case are compiled one by one and timed on the state that it reached: physics alone (on a CPU
+`mujoco.rollout` without JAX), the rest of the rollout, features, fitting, scoring, PPO.
 
 A part's floors, with peaks measured in between:
 
@@ -12,8 +12,8 @@ A part's floors, with peaks measured in between:
 - its bytes: every array that the compiled program writes, once written and once read, at the rate of a large copy;
 - its launches: instructions that the compiled program executes, loops unrolled as far as their length is known.
 
-On a CPU several devices are fake ones that share its cores: their rate shows what splitting costs. If a case does not fit
-the device's memory, a line says so, and the others continue.
+On a CPU several devices are fake ones that share its cores: their rate shows what splitting costs. If a case does not
+fit the device's memory, a line says so, and the others continue.
 """
 
 import argparse

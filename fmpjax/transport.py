@@ -117,7 +117,7 @@ def extension(
     return epsilon * jax.nn.logsumexp(logits, axis=-1), jax.nn.softmax(logits, axis=-1)
 
 
-def barycentre(probability: Float[jax.Array, "q m"], targets: Float[jax.Array, "m d"]) -> Float[jax.Array, "q d"]:
+def barycenter(probability: Float[jax.Array, "q m"], targets: Float[jax.Array, "m d"]) -> Float[jax.Array, "q d"]:
     """Mean target sum_j p_j y_j, ``[q, d]``; less x it is the gradient of a dual extension at x."""
     return jnp.matmul(probability, targets, precision=_HIGHEST)
 
@@ -149,12 +149,12 @@ class ScoreFunction(NamedTuple):
     def gradient(self, x: Float[Floats, "q d"]) -> Float[jax.Array, "q d"]:
         """Gradient of S_B at ``x [q, d]``."""
         (_, to_expert), (_, to_source) = self._extensions(x)
-        return barycentre(to_expert, self.expert_bank) - barycentre(to_source, self.source_bank)
+        return barycenter(to_expert, self.expert_bank) - barycenter(to_source, self.source_bank)
 
     def expert_extension(self, x: Float[Floats, "q d"]) -> tuple[Float[jax.Array, " q"], Float[jax.Array, "q d"]]:
         """A_E(x) ``[q]`` up to a constant, and its gradient ``[q, d]``."""
         (value, probability), _ = self._extensions(x)
-        return value, barycentre(probability, self.expert_bank) - x
+        return value, barycenter(probability, self.expert_bank) - x
 
     def match_probability(self, x: Float[Floats, "q d"]) -> Float[jax.Array, "q m"]:
         """Probability of matching each expert atom, ``[q, m]``."""

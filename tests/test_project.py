@@ -45,7 +45,9 @@ def test_the_oldest_versions_are_those_that_the_project_declares():
     """What `make test-oldest` installs: of each requirement the least version that is allowed."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     optional = project["optional-dependencies"]
-    oldest = dict(line.split("==") for line in (ROOT / "constraints-oldest.txt").read_text().splitlines() if "==" in line)
+    oldest = dict(
+        line.split("==") for line in (ROOT / "constraints-oldest.txt").read_text().splitlines() if "==" in line
+    )
     for requirement in [*project["dependencies"], *optional["viz"], *optional["retarget"]]:
         least = re.search(r">=([0-9.]+)", requirement)[1].split(".")
         pinned = oldest[_name(requirement)].split(".")
@@ -102,7 +104,8 @@ def _make(*arguments: str) -> subprocess.CompletedProcess:
             r"JAX_PLATFORMS: .*; as an environment variable it stands before make: JAX_PLATFORMS=\.\.\. make train",
         ),
         *(((target, "XYZ=1"), rf"XYZ: make {target} takes .*")
-          for target in ("render", "test", "test-fast", "test-oldest", "coverage", "check", "format", "build", "clean", "help")),
+          for target in ("render", "test", "test-fast", "test-oldest", "coverage", "check", "format", "build", "clean",
+                         "help")),
     ],
 )  # fmt: skip
 def test_make_refuses_an_unknown_variable(arguments, unknown):

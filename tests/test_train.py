@@ -419,7 +419,7 @@ def test_a_configuration_survives_its_file():
 
 
 @pytest.mark.slow
-def test_a_prior_that_normalises_by_itself_sees_windows_unclipped(walk):
+def test_a_prior_that_normalizes_by_itself_sees_windows_unclipped(walk):
     fmp, amp = (Trainer(tiny(method=method), walk) for method in ("fmp", "amp"))
     far = fmp.env.clip_windows() + 100.0
 

@@ -40,7 +40,7 @@ _STUDIES: tuple[tuple[str, ModuleType, str], ...] = (
     ("Rewards beyond the rollout that they were fitted on", generalization, _RUNS),
     ("Dynamic against static path supervision", static_teacher, _RUNS),
     ("What a barycentric target keeps of the motion", barycenter, ""),
-    ("Where the score has a minimum and the barycentre its maximum", curvature, ""),
+    ("Where the score has a minimum and the barycenter its maximum", curvature, ""),
 )
 
 

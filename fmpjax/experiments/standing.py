@@ -88,7 +88,7 @@ def gather(trainer: Trainer, state: TrainState, key: jax.Array) -> Moments:
     return Moments(windows, pushed, speed, reward, jnp.full_like(reward, reward.mean()), batch)
 
 
-def behaviours(moments: Moments, discounts=(0.97, 0.99)) -> dict[str, float]:
+def behaviors(moments: Moments, discounts=(0.97, 0.99)) -> dict[str, float]:
     """Share, mean reward, fall hazard and resulting return of the standing and of the walking moments."""
     speed, reward = np.asarray(moments.speed), np.asarray(moments.reward)
     fell, cut = np.asarray(moments.batch.fell), np.asarray(moments.batch.timed_out)
@@ -250,11 +250,11 @@ def _examine(trainer: Trainer, state: TrainState, key: jax.Array) -> tuple[Momen
 
 
 def examine(trainer: Trainer, state: TrainState, seed: int) -> dict[str, float]:
-    """All figures of one state: behaviours, gradients, fits."""
+    """All figures of one state: behaviors, gradients, fits."""
     done = int(state.iteration) * trainer.config.transitions_per_iteration
     moments, rest = _examine(trainer, state, jax.random.fold_in(jax.random.PRNGKey(seed), done))
     row = {"transitions": done, "cap": float(state.env.cap), "speed": float(moments.speed.mean())}
-    return row | behaviours(moments) | {name: float(value) for name, value in rest.items()}
+    return row | behaviors(moments) | {name: float(value) for name, value in rest.items()}
 
 
 def _write(path: Path, rows: Sequence[Mapping[str, float | str]]) -> None:

@@ -27,7 +27,7 @@ class Expert(NamedTuple):
 
     windows: jax.Array  # [W, D] every window
     dimension: float  # d, coordinates of the full features that the D stand for
-    weight: jax.Array  # [D] feature of a standardised coordinate: root of its multiplicity over sqrt(d)
+    weight: jax.Array  # [D] feature of a standardized coordinate: root of its multiplicity over sqrt(d)
     horizon: int  # frames in a window, oldest first, D / horizon coordinates each
     share: jax.Array | None = None  # [W] how often each window is drawn, summing to one; evenly where None
 
@@ -59,7 +59,7 @@ class MotionPrior(NamedTuple):
 
     init: Callable[[jax.Array], PriorState]
     update: Callable[[PriorState, Rollout, jax.Array], tuple[PriorState, jax.Array, Metrics]]
-    score: Callable[[PriorState, jax.Array], jax.Array]  # of features [n, D], higher is better, before normalisation
+    score: Callable[[PriorState, jax.Array], jax.Array]  # of features [n, D], higher is better, before normalization
 
 
 def flatten(rollout: Rollout, stand_in: Float[jax.Array, " D"]) -> Float[jax.Array, "N D"]:
@@ -111,7 +111,7 @@ def couple_draws(
 
 
 class Reward(NamedTuple):
-    """A reward and the statistics that normalised it."""
+    """A reward and the statistics that normalized it."""
 
     reward: jax.Array  # [T, N]
     median: jax.Array

@@ -1,8 +1,8 @@
 """Flow-Matched Motion Prior: the transport potential fitted online (sections III-C and III-D of the paper).
 
-Every update has a source bank drawn from the rollout, its transport to the expert bank and to itself, and takes one
-Adam step on three losses: the centred value of the score, its gradient, and the flow along rollout-to-expert paths. The
-average of the updates' parameters then scores every window.
+An update draws a source bank from the rollout, solves its transport to the expert bank and to itself, and takes one
+Adam step on three losses: the centered value of the score, its gradient, and the flow along rollout-to-expert paths.
+The average of the updates' parameters then scores every window.
 """
 
 import dataclasses
@@ -63,7 +63,7 @@ def teach(coupling: Coupling, expert: Float[jax.Array, "m D"], query: Float[jax.
     return Teacher(
         score=expert_value - source_value,
         # The -x of the two gradients cancels.
-        gradient=transport.barycentre(to_expert, expert) - transport.barycentre(to_source, source),
+        gradient=transport.barycenter(to_expert, expert) - transport.barycenter(to_source, source),
         to_expert=to_expert,
         to_source=to_source,
         solution=solution,

@@ -20,7 +20,7 @@ from fmpjax import potential, priors
 from fmpjax.config import Config, PriorConfig
 from fmpjax.errors import UserError
 from fmpjax.experiments.common import histories
-from fmpjax.experiments.common.reference import Reference, centred_error, correlation, cosine, reference, spread
+from fmpjax.experiments.common.reference import Reference, centered_error, correlation, cosine, reference, spread
 from fmpjax.logs import Progress, clock
 from fmpjax.priors import flow
 from fmpjax.shell import default
@@ -175,7 +175,7 @@ def lay_out(held_out: int, paths: int, standing: int, walking: int) -> Layout:
 def agreement(candidate: Reference, truth: Reference, layout: Layout, floor: float) -> dict[str, Any]:
     """How a candidate's score and gradient agree with a reference's at the study's queries.
 
-    Rewards are normalised by the median and range of their own scores over the queries compared. Increments are the
+    Rewards are normalized by the median and range of their own scores over the queries compared. Increments are the
     score's change from a path's source, their error is in interquartile ranges of the reference at the sources.
     """
     source = layout.paths[0]
@@ -204,7 +204,7 @@ def agreement(candidate: Reference, truth: Reference, layout: Layout, floor: flo
         "path_increment": [increment_error(rows) for rows in layout.paths],
         "walking_correlation": over(correlation, layout.walking),
         "walking_cosine": over(cosine, layout.walking, field="gradient"),
-        "executed_error": over(centred_error, executed) / jnp.maximum(spread(truth.score[executed]), floor),
+        "executed_error": over(centered_error, executed) / jnp.maximum(spread(truth.score[executed]), floor),
     }
     return jax.tree.map(float, figures)
 
