@@ -1,4 +1,4 @@
-"""Where each quantity stands in a compact frame. This order is written here and nowhere else."""
+"""Where each quantity is in a compact frame. Only this file knows the order."""
 
 from typing import NamedTuple
 

@@ -76,7 +76,7 @@ def _section(
     picture: str,
     read: Callable[[dict[str, Any]], tuple[Table, list[Verdict]]],
 ) -> Section:
-    """The section of the file called ``name`` that lies nearest below ``folder``, with the picture beside it."""
+    """The section of the file called ``name`` that is nearest below ``folder``, with the picture beside it."""
     command = f"fmpjax experiment {module}{needs} --out FOLDER"
     path = min(folder.rglob(name), key=lambda path: (len(path.parts), path), default=None)
     if path is None:

@@ -53,7 +53,7 @@ class Recorder:
         """Write a row, and what is due with it.
 
         Args:
-          at: where the training stands.
+          at: the training's clock.
           row: the metrics.
           state: what to save, in this process's memory; None where no save is due.
           evaluate: evaluate ``state``, and keep it where it is the best so far.

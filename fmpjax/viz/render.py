@@ -43,7 +43,7 @@ def render_frames(
       width: pixels.
       height: pixels.
       ghost: ``[T, 7 + J]``, a second motion drawn as a translucent robot.
-      follow: move the camera with the root, smoothly; otherwise it stands still and sees the whole path.
+      follow: move the camera with the root, smoothly; otherwise it is fixed and sees the whole path.
       labels: a caption, or one per frame.
       using: one of `BACKENDS` instead of the one that `backend` finds.
 
