@@ -10,9 +10,10 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+CONSTRAINTS := constraints.txt
 UV := $(shell command -v uv 2>/dev/null)
 install = $(if $(UV),uv pip install --quiet --python $(BIN)/python,$(BIN)/python -m pip install --quiet \
-  --disable-pip-version-check) -c constraints.txt -e
+  --disable-pip-version-check) -c $(CONSTRAINTS) -e
 
 comma := ,
 
@@ -29,7 +30,8 @@ known_train := METHOD RESET PRESET ROBOT MOTION COMMAND FRAMES SEED SEEDS RUN MI
 known_evaluate := RUN ARGS
 known_render := RUN ARGS
 known_test := WORKERS ARGS
-known_test-fast := ARGS
+known_test-fast := ARGS CONSTRAINTS
+known_test-oldest := ARGS
 known_coverage := ARGS
 goals := $(or $(MAKECMDGOALS),$(.DEFAULT_GOAL))
 known := $(foreach goal,$(goals),$(known_$(goal))) PYTHON UV VENV
@@ -38,10 +40,13 @@ unknown := $(firstword $(filter-out $(known),$(given)))
 ifneq ($(unknown),)
   close := $(shell for python in $(BIN)/python python3; do "$$python" -c 'import difflib, sys; \
     print(*difflib.get_close_matches(sys.argv[1].upper(), sys.argv[2:], 1))' '$(unknown)' $(known) 2>/dev/null && break; done)
-  $(error unknown variable $(unknown)$(if $(close),$(comma) perhaps $(close)): make $(goals) takes $(strip $(known)))
+  # What programs read from the environment belongs before `make`.
+  hint := $(if $(filter JAX_% XLA_% CUDA_% MUJOCO_% FMPJAX_% PYTHON%,$(unknown)),; as an environment variable it stands before\
+    make: $(unknown)=... make $(goals))
+  $(error unknown variable $(unknown)$(if $(close),$(comma) perhaps $(close)): make $(goals) takes $(strip $(known))$(hint))
 endif
 
-.PHONY: train evaluate render test test-fast coverage check format build clean help run-is-named
+.PHONY: train evaluate render test test-fast test-oldest coverage check format build clean help run-is-named
 
 train: $(READY) ## train a policy: METHOD RESET PRESET ROBOT MOTION COMMAND FRAMES SEED SEEDS RUN MINUTES RESUME=1
 	$(BIN)/fmpjax train $(train_options)
@@ -61,6 +66,9 @@ test: $(READY) $(VENV)/.extras ## run every test, in WORKERS processes (2)
 test-fast: $(READY) ## run the tests that take seconds
 	$(BIN)/python -m pytest -m 'not slow' $(ARGS)
 
+test-oldest: ## run the tests that take seconds with the oldest versions that pyproject.toml allows, in .venv-oldest
+	$(MAKE) test-fast VENV=.venv-oldest CONSTRAINTS=constraints-oldest.txt
+
 check: $(READY) ## lint, and check the formatting, the arrows between modules and the types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -78,7 +86,7 @@ build: $(READY) ## build the source archive and the wheel into dist/
 	$(BIN)/python -m build
 
 clean: ## remove the environment, caches and builds; runs/ stays
-	rm -rf $(VENV) build dist .coverage .hypothesis .import_linter_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-oldest build dist .coverage .hypothesis .import_linter_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help: ## show this list
@@ -88,7 +96,7 @@ run-is-named:
 	@$(if $(RUN),true,echo 'Name the run to read, for example: make $(firstword $(MAKECMDGOALS)) RUN=runs/walk' >&2; exit 2)
 
 # Interpreters are tried by running them: a name on the path may be a shim with no Python of that version behind it.
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml $(CONSTRAINTS)
 	@if [ ! -x $(BIN)/python ]; then \
 	  if [ -n '$(UV)' ]; then uv venv --quiet --seed --python '$(or $(PYTHON),>=3.11$(comma)<3.14)' $(VENV); \
 	  else \

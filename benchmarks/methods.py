@@ -1,7 +1,7 @@
 """What does each learned reward cost beside the rollout and PPO?
 
-Rollout, windows and PPO are the same for every method and timed once a round; fitting and scoring are timed for each
-in turn, on the same rollout. Overhead is the reward's time over everything else's.
+Rollout, windows and PPO are the same for every method and timed once per round. Fitting and scoring are timed for each
+method in turn, on the same rollout. Overhead is the reward's time over everything else's.
 """
 
 import argparse
@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from fmpjax import config, motion, priors
-from fmpjax.trainer import Trainer, _batch
+from fmpjax.trainer import Trainer, policy_batch
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -36,7 +36,7 @@ def main() -> None:
 
     rollout = jax.jit(lambda s, k: env.rollout(s.env, ppo.act(s.ppo), k, steps))
     windows = jax.jit(lambda s, r: trainer.feature_map(env.frame_table(s.env, r)[r.window]))
-    improve = jax.jit(lambda s, r, reward, k: ppo.update(s.ppo, _batch(r, reward), k))
+    improve = jax.jit(lambda s, r, reward, k: ppo.update(s.ppo, policy_batch(r, reward), k))
     _, record = rollout(state, key)
     seen = priors.Rollout(windows(state, record), ~record.nonfinite, record.length == 1)
     pool = seen.features.reshape(-1, seen.features.shape[-1])

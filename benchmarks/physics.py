@@ -1,9 +1,9 @@
 """How fast is each physics backend, on the same model, states and targets?
 
 ``native`` is MuJoCo C called from the scan, ``mjx-jax`` and ``mjx-warp`` run on the device; Warp, which needs
-fmpjax[warp], is made for NVIDIA and runs on a CPU in one thread. Rates are physics steps a second, medians over rounds
-in turn. Beside them stands how far the backends' joints part from the first one's: contacts magnify rounding, a wrong
-model shows at once.
+fmpjax[warp], is made for NVIDIA and runs on a CPU in one thread. Rates are physics steps per second, medians over
+rounds in turn. The last column is how far the joints are from those of the first backend: contacts magnify rounding,
+and a wrong model shows at once.
 """
 
 import argparse

@@ -3,11 +3,11 @@
 The same model, starts, targets, batch and threads, four ways, interleaved:
 
 - ``mujoco``: `mujoco.rollout` alone, one call for the whole time;
-- ``callback``: the native backend's step in `jax.lax.scan`, a callback each control step;
+- ``callback``: the native backend's step in `jax.lax.scan`, a call per control step;
 - ``observed``: the same with forward kinematics, observation, frame and fall test;
 - ``env``: `Env.rollout` under a constant policy: resets, histories and records too.
 
-Rates are physics steps a second, medians over rounds; ratios are medians of the rounds' own ratios to ``mujoco``. The
+Rates are physics steps per second, medians over rounds. Ratios are medians of each round's ratio to ``mujoco``. The
 target for ``env`` is 0.90.
 """
 
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fmpjax import config, features, motion, physics, robots
-from fmpjax.acting import Policy
+from fmpjax.acting import ActionRule
 from fmpjax.env import Env, EnvState
 from fmpjax.physics.native import NativePhysics
 
@@ -54,7 +54,7 @@ def ways(env: Env, start: EnvState, steps: int) -> dict[str, Callable[[], object
     def observed(sim, targets):
         def step(s, _):
             s = backend.step(s, targets)
-            return s, features.observe(env.robot, s.qpos, s.qvel, env.config.observation)
+            return s, features.observe(env.robot, s.qpos, s.qvel, env.form)
 
         return jax.lax.scan(step, sim, None, length=steps)
 
@@ -62,7 +62,7 @@ def ways(env: Env, start: EnvState, steps: int) -> dict[str, Callable[[], object
         return jnp.zeros((count, env.robot.joint_count)), {}
 
     def whole(state, key):
-        return env.rollout(state, Policy(constant), key, steps)
+        return env.rollout(state, ActionRule(constant), key, steps)
 
     callback, observed, whole = jax.jit(callback), jax.jit(observed), jax.jit(whole)
     return {

@@ -1,10 +1,10 @@
-"""How many transitions a second does training make, where does the time go, and what is the least it could take?
+"""How many transitions per second does training make, where does the time go, and what is the least it could take?
 
-Cases are numbers of environments, seeds and devices. Each is the whole program as a run calls it, iterations scanned
-and compiled. On a CPU all are timed in turn, round after round, so that a noisy machine disturbs them alike; on an
-accelerator, whose memory they would share, one after the other, and the table is written after each. Beside a case
-stand its parts, compiled one by one and timed on the state that it reached: physics alone (on a CPU `mujoco.rollout`
-without JAX), the rest of the rollout, features, fitting, scoring, PPO.
+A case is a number of environments, of seeds and of devices. It is the whole program as a run calls it, iterations
+scanned and compiled. On a CPU all cases are timed in turn, round after round, so that a noisy machine disturbs them
+alike. On an accelerator, whose memory they would share, they run one after the other, and the table is written after
+each. The parts of a case are compiled one by one and timed on the state that it reached: physics alone (on a CPU
+`mujoco.rollout` without JAX), the rest of the rollout, features, fitting, scoring, PPO.
 
 A part's floors, with peaks measured in between:
 
@@ -12,8 +12,8 @@ A part's floors, with peaks measured in between:
 - its bytes: every array that the compiled program writes, once written and once read, at the rate of a large copy;
 - its launches: instructions that the compiled program executes, loops unrolled as far as their length is known.
 
-On a CPU several devices are fake ones that share its cores: there the figure to look at is what splitting costs. A case
-that does not fit the device's memory is said to, and the others go on.
+On a CPU several devices are fake ones that share its cores: their rate shows what splitting costs. If a case does not
+fit the device's memory, a line says so, and the others continue.
 """
 
 import argparse
@@ -107,7 +107,7 @@ def parts(trainer, state, seeds: int) -> dict[str, Part]:
     import jax
 
     from fmpjax import priors
-    from fmpjax.trainer import _batch
+    from fmpjax.trainer import policy_batch
 
     env, ppo, prior = trainer.env, trainer.ppo, trainer.prior
     over = jax.vmap if seeds > 1 else lambda function: function
@@ -116,7 +116,7 @@ def parts(trainer, state, seeds: int) -> dict[str, Part]:
     look = over(lambda s, r: trainer.feature_map(env.frame_table(s.env, r)[r.window]))
     fit = over(lambda s, f, r, k: prior.update(s.prior, priors.Rollout(f, ~r.nonfinite, r.length == 1), k)[1])
     score = over(lambda s, f: prior.score(s.prior, f.reshape(-1, f.shape[-1])))
-    improve = over(lambda s, r, reward, k: ppo.update(s.ppo, _batch(r, reward), k)[0])
+    improve = over(lambda s, r, reward, k: ppo.update(s.ppo, policy_batch(r, reward), k)[0])
     made = {"physics": physics_alone(trainer, state), "rollout": part(play, state, keys)}
     record = made["rollout"].call()
     made["features"] = part(look, state, record)

@@ -1,4 +1,4 @@
-"""How actions are chosen: the interface between whoever learns and the environment."""
+"""How actions are chosen: the interface between the learner and the environment."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -27,8 +27,10 @@ def of_critic(seen: Any) -> Any:
     return seen.critic if isinstance(seen, Seen) else seen
 
 
-class Policy(NamedTuple):
-    """A stochastic policy, its random numbers apart, so that a rollout draws those of all its steps at once.
+class ActionRule(NamedTuple):
+    """A stochastic policy as the environment calls it.
+
+    Its random numbers are separate, so that a rollout draws those of all its steps at once.
 
     ``act(observation [N, O], drawn) -> action [N, J], extras``: normalised actions and what to remember of them, each
     ``[N, ...]``. ``draw(key, (N,)) -> drawn``: the random numbers of one step; the key itself unless told otherwise.

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fmpjax import commands, disturbances, features, offenders, physics, sharding
-from fmpjax.acting import Policy, Seen, of_actor
+from fmpjax.acting import ActionRule, Seen, of_actor
 from fmpjax.actions import ActionMap, action_map
 from fmpjax.config import Config, DisturbanceConfig
 from fmpjax.features import Observed
@@ -186,7 +186,7 @@ class Env:
         first, end = jnp.asarray(starts + self._before), jnp.asarray(starts + lengths)
         return jax.random.randint(key, (count,), first[clip], end[clip])
 
-    def history_rows(self, rows: jax.Array) -> jax.Array:
+    def history_rows(self, rows: jax.Array | np.ndarray) -> jax.Array:
         """Table rows ``[count, H]`` of the histories that end at ``rows``; ahead of a clip stands its first row."""
         rows = rows[:, None]
         before = rows - self.stride * np.arange(self.horizon)[::-1]
@@ -200,10 +200,10 @@ class Env:
     ) -> tuple[physics.PhysicsState, Observed]:
         """States at the table rows ``[N]`` and what is observed of them; with a key, joints are off by the noise."""
         qpos, qvel = jnp.asarray(self._qpos)[rows], jnp.asarray(self._qvel)[rows]
-        noise = self.config.reset_noise if noise is None else noise[:, None]
-        if key is None or (isinstance(noise, float) and not noise):
+        size = self.config.reset_noise if noise is None else noise[:, None]
+        if key is None or (isinstance(size, float) and not size):
             return physics.reset(qpos, qvel), jax.tree.map(lambda table: jnp.asarray(table)[rows], self._table)
-        angle, velocity = noise * jax.random.normal(key, (2, len(rows), self.robot.joint_count))
+        angle, velocity = size * jax.random.normal(key, (2, len(rows), self.robot.joint_count))
         qpos, qvel = qpos.at[:, 7:].add(angle), qvel.at[:, 6:].add(10.0 * velocity)
         return physics.reset(qpos, qvel), self._observe(qpos, qvel)
 
@@ -243,7 +243,7 @@ class Env:
         """All environments at fresh resets."""
         return self.start_at(self.reset_rows(key, self.config.count), jax.random.fold_in(key, 2))
 
-    def rollout(self, state: EnvState, policy: Policy, key: jax.Array, steps: int) -> tuple[EnvState, Steps]:
+    def rollout(self, state: EnvState, policy: ActionRule, key: jax.Array, steps: int) -> tuple[EnvState, Steps]:
         """``steps`` control steps under a policy; falls and time-outs reset at once."""
         count = len(state.age)
         before = self.clip_rows + 1  # rows ahead of the frames before the rollout
@@ -344,9 +344,9 @@ class Env:
 
     def _command_draws(self, keys: jax.Array, count: int) -> Any:
         """Random numbers of the commands of all steps, which have a key each."""
-        if not self.command:
+        if not (command := self.command):
             return ()
-        return jax.vmap(lambda key: self.command.draw(jax.random.fold_in(key, 3), (count,)))(keys)
+        return jax.vmap(lambda key: command.draw(jax.random.fold_in(key, 3), (count,)))(keys)
 
     def advance(self, sim: physics.PhysicsState, action: jax.Array, disturbed: Any = (), drawn: Any = ()) -> Reached:
         """The physics of one control step under normalised actions ``[N, J]``, whatever the episodes.

@@ -110,7 +110,8 @@ class Evaluation:
     def record(self) -> dict[str, Any]:
         """All figures, for JSON; what is not defined is NaN."""
         values = vars(self) | {"quality": self.quality, "starts": [start._asdict() for start in self.starts]}
-        motions = [share._asdict() for share in values.pop("motions")]
+        del values["motions"]
+        motions = [share._asdict() for share in self.motions]
         return values | ({"motions": motions} if motions else {})
 
     def to_json(self) -> str:
@@ -158,7 +159,7 @@ class Evaluator:
         key = jax.random.PRNGKey(seed)
         rows = np.asarray(env.reset_rows(key, max(self._sizes.values())))
         self.rows = np.concatenate([rows[:count] for count in self._sizes.values()])
-        self._noise = np.repeat(np.float32(list(self._sizes)), list(self._sizes.values()))
+        self._noise = np.repeat(np.array(list(self._sizes), np.float32), list(self._sizes.values()))
         self._key = np.asarray(jax.random.fold_in(key, 2))
         # The discrepancy is in the paper's features whatever the run's own are, so that it compares.
         paper = FeatureConfig(history=env.horizon)
@@ -171,7 +172,7 @@ class Evaluator:
 
     def start(self) -> EnvState:
         """The episodes' starts, the headline's first."""
-        return self.trainer.env.start_at(jnp.asarray(self.rows), self._key, jnp.asarray(self._noise))
+        return self.trainer.env.start_at(jnp.asarray(self.rows), jnp.asarray(self._key), jnp.asarray(self._noise))
 
     @partial(jax.jit, static_argnums=0)
     def _play(self, state: PPOState):

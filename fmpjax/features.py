@@ -14,6 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from fmpjax import kinematics, rotations
 from fmpjax.config import Config, FeatureConfig
@@ -21,6 +22,8 @@ from fmpjax.errors import UserError
 from fmpjax.frames import FORWARD, PLANAR, FrameLayout
 from fmpjax.motion.library import parse
 from fmpjax.robots import Robot
+
+Floats = jax.Array | np.ndarray  # JAX takes both
 
 
 class _Parts(NamedTuple):
@@ -66,7 +69,7 @@ def _rotation_terms(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         cosine.append(unit - along)
         sine.append(np.cross(axis, unit))
         constant.append(along)
-    return tuple(np.concatenate(term, axis=-1) for term in (cosine, sine, constant))
+    return np.concatenate(cosine, axis=-1), np.concatenate(sine, axis=-1), np.concatenate(constant, axis=-1)
 
 
 def _joint_rotations(robot: Robot, joints: jax.Array) -> jax.Array:
@@ -81,7 +84,9 @@ def _joint_rotations(robot: Robot, joints: jax.Array) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames=("robot",), inline=True)
-def actor_observation(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+def actor_observation(
+    robot: Robot, qpos: Float[Floats, "*batch q"], qvel: Float[Floats, "*batch v"]
+) -> Float[jax.Array, "*batch O"]:
     """The policy's observation, ``[..., 237]`` for the G1.
 
     Root height (m), root rotation 6D, root velocity (m/s) and angular velocity (rad/s) in world axes, joint rotations
@@ -175,7 +180,9 @@ def _observation(robot: Robot, p: _Parts, form: str) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames=("robot",), inline=True)
-def prior_window(robot: Robot, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+def prior_window(
+    robot: Robot, qpos: Float[Floats, "*batch H q"], qvel: Float[Floats, "*batch H v"]
+) -> Float[jax.Array, "*batch D"]:
     """The prior's window before normalisation, ``[..., H * 239]`` for the G1, oldest frame first.
 
     A frame is root position (m; x and y relative to the newest frame, z absolute), root rotation 6D, joint rotations
@@ -225,7 +232,7 @@ def _turned(p: _Parts) -> _Parts:
 
 
 @partial(jax.jit, static_argnames=("robot", "form"), inline=True)
-def observe(robot: Robot, qpos: jax.Array, qvel: jax.Array, form: str) -> Observed:
+def observe(robot: Robot, qpos: Float[Floats, "*batch q"], qvel: Float[Floats, "*batch v"], form: str) -> Observed:
     """The policy's observation, the compact frame and the fall test of states ``qpos``, ``qvel``.
 
     The observation is of the robot alone, in the ``form`` that `observation_form` names, without the command.
@@ -255,7 +262,7 @@ def frame_size(robot: Robot) -> int:
     return FrameLayout.of(robot).size - 2 * robot.joint_count + 6 * _rotations(robot)
 
 
-def compact_weights(robot: Robot) -> np.ndarray:
+def compact_weights(robot: Robot) -> Float[np.ndarray, " F"]:
     """How often a compact coordinate stands in the full frame, as a distance weight (square root), ``[F]``."""
     cosine, sine, _ = _rotation_terms(robot)
     if not np.isin(np.abs(robot.joint_axis), (0, 1)).all():
@@ -283,7 +290,7 @@ def _planar(robot: Robot) -> _Planar:
     return _Planar(other, sign)
 
 
-def turned_windows(windows: jax.Array, planar: _Planar) -> jax.Array:
+def turned_windows(windows: Float[jax.Array, "*batch H F"], planar: _Planar) -> Float[jax.Array, "*batch H F"]:
     """Relative windows ``[..., H, F]`` in axes of which x points where the newest frame's root does."""
     forward = windows[..., -1:, FORWARD]
     cosine, sine = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
@@ -291,7 +298,7 @@ def turned_windows(windows: jax.Array, planar: _Planar) -> jax.Array:
     return jnp.where(planar.sign == 0, windows, turned)
 
 
-def relative_windows(frames: jax.Array) -> jax.Array:
+def relative_windows(frames: Float[jax.Array, "*batch H F"]) -> Float[jax.Array, "*batch H F"]:
     """Windows ``[..., H, F]`` of compact frames with x and y made relative to the newest frame."""
     return frames.at[..., PLANAR].add(-frames[..., -1:, PLANAR])
 
@@ -310,19 +317,22 @@ class FeatureMap(NamedTuple):
     dimension: jax.Array  # scalar, d
     planar: _Planar | None = None  # set where windows are turned to their own heading
 
-    def __call__(self, frames: jax.Array) -> jax.Array:
+    def __call__(self, frames: Float[jax.Array, "*batch H F"]) -> Float[jax.Array, "*batch D"]:
         """Features ``[..., H * F]`` of windows of compact frames ``[..., H, F]``, absolute or relative."""
         z = (_placed(frames, self.planar) - self.mean) / self.deviation
         x = jnp.clip(z, -self.clip, self.clip) * self.weight
         return x.reshape(*x.shape[:-2], -1)
 
     def unclipped(self) -> "FeatureMap":
-        """The same map without the clip, for a prior that normalises and clips by itself."""
+        """The same map without the clip, for a prior that normalizes and clips windows itself."""
         return self._replace(clip=jnp.float32(jnp.inf))
 
 
 def fit_feature_map(
-    robot: Robot, windows: jax.Array, config: FeatureConfig, share: np.ndarray | None = None
+    robot: Robot,
+    windows: Float[jax.Array, "W H F"],
+    config: FeatureConfig,
+    share: Float[np.ndarray, " W"] | None = None,
 ) -> FeatureMap:
     """Feature map from the demonstrations' windows of compact frames ``[W, H, F]``, weighed by ``share [W]``."""
     dimension = config.history * frame_size(robot)

@@ -1,10 +1,11 @@
-"""Where each quantity stands in a compact frame. This order is written here and nowhere else."""
+"""Where each quantity is in a compact frame. Only this file knows the order."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from fmpjax.robots import Robot
 
@@ -33,7 +34,7 @@ class FrameLayout(NamedTuple):
         return self[-1].stop
 
     @classmethod
-    def join(cls, **parts: jax.Array) -> jax.Array:
+    def join(cls, **parts: Float[jax.Array, "*batch _"]) -> Float[jax.Array, "*batch F"]:
         """Frames ``[..., F]`` of their parts, each given by its field's name."""
         return jnp.concatenate([parts[name] for name in cls._fields], axis=-1)
 

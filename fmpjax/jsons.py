@@ -9,7 +9,7 @@ import numpy as np
 
 
 def dumps(value: Any) -> str:
-    """``value`` as an indented JSON text; a number that is not finite, however deep it lies, is null."""
+    """``value`` as an indented JSON text; a number that is not finite, at any depth, is null."""
     return json.dumps(_finite(value), indent=1, allow_nan=False)
 
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import linen
+from jaxtyping import Float, Int
 
 Initializer = Callable[..., jax.Array]
 
@@ -105,7 +106,7 @@ def step_if_finite(
     return Step(*kept, finite, norm)
 
 
-def permutation(key: jax.Array, count: int) -> jax.Array:
+def permutation(key: jax.Array, count: int) -> Int[jax.Array, " n"]:
     """A random order of ``count`` rows, by one sort of random numbers whose last bits are the rows.
 
     `jax.random.permutation` sorts pairs, and twice. Rows that share their random bits, one in five of 32,768, keep the
@@ -129,7 +130,9 @@ def newest_share(half_life: float) -> float:
     return 1.0 - 0.5 ** (1.0 / half_life)
 
 
-def standardize(x: jax.Array, mean: jax.Array, deviation: jax.Array, clip: float) -> jax.Array:
+def standardize(
+    x: Float[jax.Array, "*batch n"], mean: Float[jax.Array, " n"], deviation: Float[jax.Array, " n"], clip: float
+) -> Float[jax.Array, "*batch n"]:
     """``(x - mean) / deviation``, clipped to the magnitude ``clip``."""
     return jnp.clip((x - mean) / deviation, -clip, clip)
 
@@ -137,14 +140,19 @@ def standardize(x: jax.Array, mean: jax.Array, deviation: jax.Array, clip: float
 # --- scores ----------------------------------------------------------------------------------------------------------
 
 
-def median_and_spread(x: jax.Array, quantile: Callable[..., jax.Array] = jnp.quantile) -> tuple[jax.Array, jax.Array]:
+def median_and_spread(
+    x: Float[jax.Array, "..."], quantile: Callable[..., jax.Array] = jnp.quantile
+) -> tuple[Float[jax.Array, ""], Float[jax.Array, ""]]:
     """Median and interquartile range of all numbers of ``x``; `jnp.nanquantile` leaves out those that are NaN."""
     low, middle, high = quantile(x, jnp.array([0.25, 0.5, 0.75]))
     return middle, high - low
 
 
 def score_metrics(
-    median: jax.Array, spread: jax.Array, demonstration: jax.Array | None = None, floor: float = 1e-6
+    median: Float[jax.Array, ""],
+    spread: Float[jax.Array, ""],
+    demonstration: Float[jax.Array, " m"] | None = None,
+    floor: float = 1e-6,
 ) -> Mapping[str, jax.Array]:
     """The metrics that every prior gives of its scores.
 

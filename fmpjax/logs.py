@@ -17,7 +17,7 @@ _FIRST = ("iteration", "transitions", "seconds")
 
 
 class MetricsLog:
-    """``metrics.csv`` and ``tensorboard/`` of a run folder; a resumed run goes on where its checkpoint stands.
+    """``metrics.csv`` and ``tensorboard/`` of a run folder; a resumed run continues at its checkpoint.
 
     With ``keep=False`` nothing is written: another process does.
     """

@@ -1,4 +1,4 @@
-"""What a run needs of main memory at least, asked before it starts: the system kills a process that takes too much.
+"""The least main memory that a run needs, checked before it starts: the system kills a process that takes too much.
 
 On an accelerator nothing is estimated: its allocator refuses with an error, of which `fmpjax.runs` makes a sentence.
 """
@@ -11,7 +11,7 @@ from fmpjax.errors import UserError
 
 
 def parts(config: Config, seeds: int = 1) -> dict[str, int]:
-    """Bytes that a training program needs at least, by the setting that they grow with.
+    """The least bytes that a training program needs, by the setting that they grow with.
 
     Only large arrays that exist at the same time are counted. The compiled programs that were measured (in
     ``tests/test_memory.py``) take 1.2 to 2.7 times the sum.

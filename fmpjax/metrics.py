@@ -1,7 +1,7 @@
 """Gait metrics of an evaluation (paper, section "Evaluation protocol and metrics").
 
 Everything is a pure function on NumPy arrays, computed in float64. ``T`` recorded steps, ``N`` environments; the state
-after step ``k`` stands in row ``k``, at time ``(k + 1) / rate``. ``length [N]``, 1 to T, counts the rows of the first
+after step ``k`` is in row ``k``, at time ``(k + 1) / rate``. ``length [N]``, 1 to T, counts the rows of the first
 episode; later rows are never read. The metrics return one value per episode, NaN where an episode does not contribute;
 `summarise` makes the number to report and how many episodes stand behind it.
 """
@@ -17,7 +17,7 @@ from fmpjax.errors import UserError
 RATE = Config().control_rate  # Hz, the paper's control steps
 LATE_START, LATE_END = 5.0, 10.0  # s, both included [P]
 WINDOW = 1.0  # s, of a joint range [P]
-PERCENTILES = 5.0, 95.0  # between which a joint range lies [P]
+PERCENTILES = 5.0, 95.0  # that bound a joint range [P]
 STILL = 1e-6  # rad; a joint whose expert range is smaller has no ratio to it [D]
 TURNS = 0.1  # rad/s, from which a demonstration turns [D]
 

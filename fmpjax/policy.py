@@ -1,4 +1,4 @@
-"""A trained policy by itself: one small file, and NumPy to run it, away from the training stack."""
+"""A trained policy without the training stack: one small file, and NumPy to run it."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple

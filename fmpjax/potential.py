@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 HEADS = 3
 SCORE_CONTRAST = np.array([1.0, -0.5, -0.5], np.float32)  # weights of the heads in the score
@@ -40,7 +41,9 @@ def init(key: jax.Array, size: int, dimension: float, hidden: Sequence[int]) -> 
     return Params(jnp.zeros((HEADS, size)), tuple(weights), tuple(jnp.zeros(w.shape[1]) for w in weights))
 
 
-def heads(params: Params, x: jax.Array, tau: jax.Array, dimension: jax.Array) -> jax.Array:
+def heads(
+    params: Params, x: Float[jax.Array, "n D"], tau: Float[jax.Array, " n"], dimension: jax.Array | float
+) -> Float[jax.Array, "n 3"]:
     """All three potentials ``[n, 3]`` at ``x [n, D]`` and flow times ``tau [n]``."""
     time = jnp.stack([tau, tau**2, jnp.sin(jnp.pi * tau), jnp.cos(jnp.pi * tau)], axis=-1)
     # Splitting the first layer spares a concatenated copy of x.
@@ -52,7 +55,13 @@ def heads(params: Params, x: jax.Array, tau: jax.Array, dimension: jax.Array) ->
     return h + x @ params.linear.T - 0.5 * jnp.sum(x * x, axis=-1, keepdims=True)
 
 
-def contrast(params: Params, x: jax.Array, tau: jax.Array, weights: jax.Array, dimension: jax.Array):
+def contrast(
+    params: Params,
+    x: Float[jax.Array, "n D"],
+    tau: Float[jax.Array, " n"],
+    weights: Float[jax.Array, "n 3"],
+    dimension: jax.Array | float,
+) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n D"]]:
     """Weighted sums of heads and their gradients in x.
 
     Args:
@@ -66,12 +75,14 @@ def contrast(params: Params, x: jax.Array, tau: jax.Array, weights: jax.Array, d
     return values, gradients
 
 
-def score(params: Params, x: jax.Array, dimension: jax.Array) -> jax.Array:
+def score(params: Params, x: Float[jax.Array, "n D"], dimension: jax.Array | float) -> Float[jax.Array, " n"]:
     """The learned score S(x), ``[n]``, at flow time zero."""
     return heads(params, x, jnp.zeros(x.shape[:-1], x.dtype), dimension) @ SCORE_CONTRAST
 
 
-def score_and_gradient(params: Params, x: jax.Array, dimension: jax.Array) -> tuple[jax.Array, jax.Array]:
+def score_and_gradient(
+    params: Params, x: Float[jax.Array, "n D"], dimension: jax.Array | float
+) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n D"]]:
     """S(x) ``[n]`` and its gradient ``[n, D]``."""
     weights = jnp.broadcast_to(jnp.asarray(SCORE_CONTRAST, x.dtype), (*x.shape[:-1], HEADS))
     return contrast(params, x, jnp.zeros(x.shape[:-1], x.dtype), weights, dimension)

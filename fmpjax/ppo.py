@@ -14,7 +14,7 @@ import optax
 from flax import linen
 
 from fmpjax import learning, machine, sharding
-from fmpjax.acting import Policy, Seen, of_actor, of_critic
+from fmpjax.acting import ActionRule, Seen, of_actor, of_critic
 from fmpjax.config import PPOConfig
 
 machine.import_mjx()  # which Brax imports
@@ -127,10 +127,11 @@ class PPO:
 
     def policy(self, actor, normalizer: RunningStatisticsState, observation: Any) -> tuple[jax.Array, jax.Array]:
         """Mean and deviation ``[..., J]`` of the action distribution."""
-        mean, deviation = self._actor.apply(actor, self._normalized(normalizer, observation, of_actor))
+        output: Any = self._actor.apply(actor, self._normalized(normalizer, observation, of_actor))
+        mean, deviation = output
         return mean, deviation if self.config.learn_deviation else jax.lax.stop_gradient(deviation)
 
-    def act(self, state: PPOState, deterministic: bool = False) -> Policy:
+    def act(self, state: PPOState, deterministic: bool = False) -> ActionRule:
         """The policy as the environment calls it."""
 
         def draw(key, shape):
@@ -141,7 +142,7 @@ class PPO:
             action = mean if deterministic else mean + deviation * noise
             return action, {"mean": mean, "deviation": deviation}
 
-        return Policy(act, draw)
+        return ActionRule(act, draw)
 
     def layers(self, actor) -> list[tuple[np.ndarray, np.ndarray]]:
         """Kernel ``[in, out]`` and bias ``[out]`` of each layer of the actor, the last of which gives the mean."""

@@ -21,7 +21,7 @@ def provenance() -> dict[str, object]:
     here = Path(__file__).parent
 
     def git(*arguments: str) -> str | None:
-        # An installed wheel may lie in somebody else's repository.
+        # An installed wheel may be inside another repository.
         if not (here.parent / "pyproject.toml").exists():
             return None
         try:

@@ -1,4 +1,4 @@
-"""Where the shipped robots and motions lie: inside the installed wheel, or beside the package in a checkout."""
+"""Where the shipped robots and motions are: inside the installed wheel, or beside the package in a checkout."""
 
 from pathlib import Path
 

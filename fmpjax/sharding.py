@@ -1,8 +1,8 @@
 """One program on several devices, of one process or many: environments, or seeds, split over a mesh.
 
-The program is written for one device. Where a mesh is in force, XLA partitions it after the few hints that `split`
-and `gather` give, and sums gradients and statistics over devices: the numbers are those of one device, to rounding.
-Where none is, the hints do nothing. Of several processes each runs the same host code; the first alone writes.
+The program is written for one device. With a mesh, XLA partitions it by the few hints that `split` and `gather` give,
+and sums gradients and statistics over devices: the numbers are those of one device, up to rounding. Without a mesh the
+hints do nothing. Of several processes each runs the same host code, and only the first one writes.
 """
 
 from collections.abc import Callable
@@ -79,7 +79,7 @@ def wait(what: str) -> None:
 
 
 def on_host(tree: Any) -> Any:
-    """Whole arrays in the memory of this process, wherever their parts lie."""
+    """Whole arrays in the memory of this process, wherever their parts are."""
     return jax.tree.map(
         lambda x: (
             jax.device_get(x)
@@ -91,7 +91,7 @@ def on_host(tree: Any) -> Any:
 
 
 def of(array: jax.Array) -> Mesh | None:
-    """The mesh that an array lies on, None where it is on one device."""
+    """The mesh that an array is on; None if it is on one device."""
     # An array that is no tracer has a mesh of devices, not an abstract one.
     return array.sharding.mesh if isinstance(array.sharding, NamedSharding) else None  # ty: ignore[invalid-explicit-return]
 
@@ -107,7 +107,7 @@ def everywhere(over: Mesh) -> NamedSharding:
 
 
 def split(tree: Any, axis: int = 0) -> Any:
-    """Hint: the arrays' ``axis`` lies over the devices, where its length divides by their number."""
+    """Hint: split the arrays' ``axis`` over the devices, if its length is a multiple of their number."""
     devices = _in_force()
     if not devices:
         return tree
@@ -125,7 +125,7 @@ def gather(tree: Any) -> Any:
 
 
 def per_device(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of arrays with a leading axis, called on each device with its own rows alone.
+    """A function of arrays with a leading axis, called on each device with only its own rows.
 
     Host callbacks need it: XLA cannot partition what it cannot see.
     """
@@ -133,7 +133,7 @@ def per_device(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def alone(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that each device computes for itself on whole arrays, without a word from the others."""
+    """A function that each device computes for itself on whole arrays, without an exchange."""
     return _mapped(function, PartitionSpec())
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import os
+import select
 import sys
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -71,11 +72,21 @@ def ending() -> Generator[None]:
                 # Here, since a pipe that turns out to be closed when Python exits cannot be caught.
                 if sys.stdout:
                     sys.stdout.flush()
-    except BrokenPipeError:  # `head`, say, has read enough
+    except BrokenPipeError:
+        if not _reader_gone():  # another pipe broke, such as a child process's
+            raise
         null = os.open(os.devnull, os.O_WRONLY)
         for stream in (sys.stdout, sys.stderr):
             os.dup2(null, stream.fileno())
         sys.exit(1)
+
+
+def _reader_gone() -> bool:
+    """Whether nobody reads the output any more: `head`, say, has read enough."""
+    poll = select.poll()
+    for stream in (sys.stdout, sys.stderr):
+        poll.register(stream, 0)  # errors and hang-ups are always reported
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
 @contextlib.contextmanager

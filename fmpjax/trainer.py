@@ -22,7 +22,7 @@ from fmpjax.ppo import PPO, Batch, PPOState
 
 
 class TrainState(NamedTuple):
-    """Everything a run is; what is not here does not exist after a resume."""
+    """The whole state of a run. Only this is checkpointed."""
 
     ppo: PPOState
     prior: Any
@@ -111,7 +111,7 @@ class Trainer:
             state.prior, priors.Rollout(windows, ~steps.nonfinite, steps.length == 1), prior_key
         )
         reward, command_metrics = self._commanded(steps, reward)
-        ppo, ppo_metrics = self.ppo.update(state.ppo, _batch(steps, reward), ppo_key)
+        ppo, ppo_metrics = self.ppo.update(state.ppo, policy_batch(steps, reward), ppo_key)
         skipped = prior_metrics.get("skipped", 0.0) + ppo_metrics["skipped"]
         nonfinite = state.nonfinite + steps.nonfinite.sum().astype(jnp.int32) + jnp.int32(skipped)
         figures = (
@@ -144,14 +144,15 @@ class Trainer:
             return state, jax.tree.map(jnp.nanmean, figures)
 
         over = sharding.of(state.iteration)
+        program: Callable[[TrainState], Any] = chunk
         if state.iteration.ndim:
-            chunk = sharding.per_device(jax.vmap(chunk))
+            program = sharding.per_device(jax.vmap(chunk))
         if over is None:
-            return jax.jit(chunk, donate_argnums=0).lower(state).compile()
+            return jax.jit(program, donate_argnums=0).lower(state).compile()
         placed = jax.tree.map(lambda leaf: leaf.sharding, state)
         with jax.set_mesh(over):
             shardings = (placed, sharding.everywhere(over))
-            return jax.jit(chunk, donate_argnums=0, out_shardings=shardings).lower(state).compile()
+            return jax.jit(program, donate_argnums=0, out_shardings=shardings).lower(state).compile()
 
     def place(self, state: TrainState, over: Mesh) -> TrainState:
         """The state on the devices of a mesh: environments, or seeds where there are several, split over them.
@@ -171,7 +172,7 @@ class Trainer:
 def _check(clip: MotionClip, robot: robots.Robot, config: Config) -> None:
     if abs(clip.rate - config.control_rate) > 1e-6:
         raise UserError(
-            f"motion {clip.name} has {clip.rate:g} samples a second: expected the control rate, "
+            f"motion {clip.name} has {clip.rate:g} samples per second: expected the control rate, "
             f"{config.control_rate:g} Hz"
         )
     if not robot.takes(clip.robot):
@@ -198,7 +199,8 @@ def unstack(state: TrainState) -> list[TrainState]:
     return [jax.tree.map(itemgetter(i), state) for i in range(len(state.iteration))]
 
 
-def _batch(steps: Steps, reward: jax.Array) -> Batch:
+def policy_batch(steps: Steps, reward: jax.Array) -> Batch:
+    """What PPO learns from: a rollout, and its rewards ``[T, N]``."""
     return Batch(
         observation=steps.observation,
         next_observation=steps.next_observation,

@@ -8,24 +8,28 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
 from ott.geometry import geometry
 from ott.problems.linear import linear_problem
 from ott.solvers.linear import acceleration, sinkhorn
+
+Floats = jax.Array | np.ndarray  # JAX takes both
 
 # TF32 spoils Sinkhorn: costs are differences of large inner products.
 _HIGHEST = jax.lax.Precision.HIGHEST
 
 
-def squared_cost(x: jax.Array, y: jax.Array) -> jax.Array:
+def squared_cost(x: Float[Floats, "n d"], y: Float[Floats, "m d"]) -> Float[jax.Array, "n m"]:
     """Costs |x_i - y_j|^2 / 2, ``[n, m]``, of points ``x [n, d]`` and ``y [m, d]`` as one matrix product."""
     inner = jnp.matmul(x, y.T, precision=_HIGHEST)
     return jnp.maximum(0.5 * (jnp.sum(x * x, -1)[:, None] + jnp.sum(y * y, -1)[None, :]) - inner, 0.0)
 
 
-def median(values: jax.Array) -> jax.Array:
+def median(values: Float[jax.Array, "..."]) -> Float[jax.Array, ""]:
     """Median of finite values >= 0 of any shape, exactly.
 
-    Non-negative floats are ordered as their bits, so bisection over bits needs one count a bit: on a CPU that is many
+    Non-negative floats are ordered as their bits, so bisection over bits needs one count per bit. On a CPU that is many
     times faster than XLA's sort.
     """
     integer = jnp.int64 if values.dtype == jnp.float64 else jnp.int32
@@ -44,7 +48,9 @@ def median(values: jax.Array) -> jax.Array:
     return 0.5 * (low + high)
 
 
-def entropy_coefficient(cost: jax.Array, dimension: jax.Array | int, fraction: float = 0.1) -> jax.Array:
+def entropy_coefficient(
+    cost: Float[jax.Array, "n m"], dimension: jax.Array | float, fraction: float = 0.1
+) -> Float[jax.Array, ""]:
     """Epsilon of a cross cost ``[n, m]``: a fraction of its median, at least 1e-3 / d."""
     return jnp.maximum(fraction * median(cost), 1e-3 / dimension)
 
@@ -60,9 +66,9 @@ class Solve(NamedTuple):
 
 
 def solve(
-    cross_cost: jax.Array,
-    self_cost: jax.Array,
-    epsilon: jax.Array,
+    cross_cost: Float[jax.Array, "n m"],
+    self_cost: Float[jax.Array, "k k"],
+    epsilon: Float[jax.Array, ""],
     *,
     threshold: float = 1e-3,
     max_iterations: int = 200,
@@ -95,7 +101,9 @@ def solve(
     )
 
 
-def extension(cost: jax.Array, dual: jax.Array, epsilon: jax.Array) -> tuple[jax.Array, jax.Array]:
+def extension(
+    cost: Float[jax.Array, "q m"], dual: Float[jax.Array, " m"], epsilon: Float[jax.Array, ""]
+) -> tuple[Float[jax.Array, " q"], Float[jax.Array, "q m"]]:
     """Dual extension A(x) and matching probabilities (eqs. extension and gradient).
 
     Args:
@@ -109,7 +117,7 @@ def extension(cost: jax.Array, dual: jax.Array, epsilon: jax.Array) -> tuple[jax
     return epsilon * jax.nn.logsumexp(logits, axis=-1), jax.nn.softmax(logits, axis=-1)
 
 
-def barycentre(probability: jax.Array, targets: jax.Array) -> jax.Array:
+def barycenter(probability: Float[jax.Array, "q m"], targets: Float[jax.Array, "m d"]) -> Float[jax.Array, "q d"]:
     """Mean target sum_j p_j y_j, ``[q, d]``; less x it is the gradient of a dual extension at x."""
     return jnp.matmul(probability, targets, precision=_HIGHEST)
 
@@ -133,29 +141,29 @@ class ScoreFunction(NamedTuple):
         to_source = extension(squared_cost(x, source), self.solution.self_dual, self.epsilon)
         return to_expert, to_source
 
-    def score(self, x: jax.Array) -> jax.Array:
+    def score(self, x: Float[Floats, "q d"]) -> Float[jax.Array, " q"]:
         """S_B(x) = A_E(x) - (A_P1(x) + A_P2(x)) / 2, ``[q]``, up to a constant (eq. score)."""
         (expert, _), (source, _) = self._extensions(x)
         return expert - source
 
-    def gradient(self, x: jax.Array) -> jax.Array:
+    def gradient(self, x: Float[Floats, "q d"]) -> Float[jax.Array, "q d"]:
         """Gradient of S_B at ``x [q, d]``."""
         (_, to_expert), (_, to_source) = self._extensions(x)
-        return barycentre(to_expert, self.expert_bank) - barycentre(to_source, self.source_bank)
+        return barycenter(to_expert, self.expert_bank) - barycenter(to_source, self.source_bank)
 
-    def expert_extension(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def expert_extension(self, x: Float[Floats, "q d"]) -> tuple[Float[jax.Array, " q"], Float[jax.Array, "q d"]]:
         """A_E(x) ``[q]`` up to a constant, and its gradient ``[q, d]``."""
         (value, probability), _ = self._extensions(x)
-        return value, barycentre(probability, self.expert_bank) - x
+        return value, barycenter(probability, self.expert_bank) - x
 
-    def match_probability(self, x: jax.Array) -> jax.Array:
+    def match_probability(self, x: Float[Floats, "q d"]) -> Float[jax.Array, "q m"]:
         """Probability of matching each expert atom, ``[q, m]``."""
         return self._extensions(x)[0][1]
 
 
 def fit_score(
-    source_bank: jax.Array,
-    expert_bank: jax.Array,
+    source_bank: Float[Floats, "n d"],
+    expert_bank: Float[Floats, "m d"],
     *,
     epsilon: float | jax.Array | None = None,
     threshold: float = 1e-6,

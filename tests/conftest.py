@@ -1,4 +1,8 @@
-"""What the tests share. ``FMPJAX_TEST_DATA`` may name a folder with data that is not shipped; tests pass without it."""
+"""What the tests share.
+
+``FMPJAX_TEST_DATA`` may name a folder with data that is not shipped; tests pass without it. ``FMPJAX_TEST_SHAPES=0``
+leaves out the checks of the shapes that functions state.
+"""
 
 import os
 import tempfile
@@ -8,13 +12,11 @@ from pathlib import Path
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Four fake devices, on which programs that several devices share are tested; everything else runs on the first.
 # Compiling is most of the time. It takes a third without optimization and without the emitters of fused loops.
-_FLAGS = (
-    "--xla_force_host_platform_device_count=4",
-    "--xla_backend_optimization_level=0",
-    "--xla_llvm_disable_expensive_passes=true",
-    "--xla_cpu_use_fusion_emitters=false",
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_force_host_platform_device_count=4 --xla_backend_optimization_level=0 "
+    "--xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false",
 )
-os.environ.setdefault("XLA_FLAGS", " ".join(_FLAGS))
 # Programs, the smallest too, are compiled once for all processes of the tests, and for the next time.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"fmpjax-tests-{os.getuid()}"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
@@ -22,9 +24,18 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 # A device that waits for the others holds one of the threads of XLA, which makes one a core: too few are a deadlock.
 os.environ.setdefault("NPROC", str(2 * max(os.cpu_count() or 1, 4)))
 
+import jaxtyping
 import pytest
 
-from fmpjax import motion, robots
+# Before the package is imported: each call of these modules' functions is checked against its annotations.
+CHECKED = [
+    f"fmpjax.{name}"
+    for name in ("features", "frames", "learning", "potential", "priors.base", "priors.flow", "rotations", "transport")
+]
+if os.environ.get("FMPJAX_TEST_SHAPES") != "0":
+    jaxtyping.install_import_hook(CHECKED, "beartype.beartype")
+
+from fmpjax import motion, robots  # noqa: E402
 
 
 @pytest.fixture(scope="session")

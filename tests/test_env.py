@@ -12,7 +12,7 @@ import pytest
 
 from fmpjax import env as environments
 from fmpjax import features, motion, physics, robots
-from fmpjax.acting import Policy
+from fmpjax.acting import ActionRule
 from fmpjax.config import preset
 from fmpjax.env import Env
 
@@ -57,7 +57,12 @@ def policy_of(low, high):
         first = jax.random.uniform(jax.random.fold_in(key, 1), (len(observation),), minval=low, maxval=high)
         return action.at[:, 0].set(first), {"mean": action, "deviation": jnp.ones_like(action)}
 
-    return Policy(policy)
+    return ActionRule(policy)
+
+
+def _noise():
+    """Actions that are random numbers."""
+    return ActionRule(lambda _, noise: (noise, {}), lambda key, shape: jax.random.normal(key, (*shape, JOINTS)))
 
 
 ROBOT = robots.load("unitree_g1")
@@ -467,7 +472,9 @@ def test_actions_reach_the_physics_through_the_map():
 def test_every_step_of_a_rollout_has_random_numbers_of_its_own():
     """Drawn for all steps at once, they are those that each step would draw from its own key."""
     built, key = make(), jax.random.PRNGKey(5)
-    policy = Policy(lambda observation, noise: (noise, {}), lambda key, shape: jax.random.normal(key, (*shape, JOINTS)))
+    policy = ActionRule(
+        lambda observation, noise: (noise, {}), lambda key, shape: jax.random.normal(key, (*shape, JOINTS))
+    )
     _, record = built.rollout(built.reset(key), policy, key, 4)
     for step_key, action in zip(jax.random.split(key, 4), record.action, strict=True):
         policy_key, _ = jax.random.split(step_key)
@@ -478,7 +485,9 @@ def test_a_step_launches_few_kernels():
     """A launch costs microseconds, whatever it computes: a step of 575 was a fifth of an iteration."""
     native = Env(ROBOT, CLIP, preset("laptop"), physics.make(ROBOT, preset("laptop").physics))
     state = jax.eval_shape(native.reset, jax.random.PRNGKey(0))
-    policy = Policy(lambda observation, noise: (noise, {}), lambda key, shape: jax.random.normal(key, (*shape, JOINTS)))
+    policy = ActionRule(
+        lambda observation, noise: (noise, {}), lambda key, shape: jax.random.normal(key, (*shape, JOINTS))
+    )
 
     def launches(steps):
         program = jax.jit(lambda state, key: native.rollout(state, policy, key, steps))

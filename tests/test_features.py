@@ -173,7 +173,7 @@ def case(request, robot, walk, observe):
 
 
 def full_features(windows, demonstration, floor, clip=10.0):
-    """The 2,390 standardised, clipped and scaled coordinates, float64."""
+    """The 2,390 standardized, clipped and scaled coordinates, float64."""
     mean, deviation = demonstration.mean(0), np.maximum(demonstration.std(0), floor)
     z = np.clip((windows - mean) / deviation, -clip, clip)
     return z / np.sqrt(FULL), np.abs((windows - mean) / deviation) > clip

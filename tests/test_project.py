@@ -41,6 +41,19 @@ def test_every_requirement_is_imported_and_pinned():
     assert {_name(requirement) for requirement in optional["dev"]} <= pinned
 
 
+def test_the_oldest_versions_are_those_that_the_project_declares():
+    """What `make test-oldest` installs: of each requirement the least version that is allowed."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    optional = project["optional-dependencies"]
+    oldest = dict(
+        line.split("==") for line in (ROOT / "constraints-oldest.txt").read_text().splitlines() if "==" in line
+    )
+    for requirement in [*project["dependencies"], *optional["viz"], *optional["retarget"]]:
+        least = re.search(r">=([0-9.]+)", requirement)[1].split(".")
+        pinned = oldest[_name(requirement)].split(".")
+        assert pinned == least + ["0"] * (len(pinned) - len(least)), requirement
+
+
 def test_the_examples_of_docstrings_are_right():
     found = doctest.testmod(transport)
     assert found.attempted and not found.failed
@@ -86,8 +99,13 @@ def _make(*arguments: str) -> subprocess.CompletedProcess:
         (("train", "OPTIMIZER=adam"), r"OPTIMIZER: make train takes .*"),
         (("evaluate", "RUN=a", "PRESET=smoke"), r"PRESET: make evaluate takes RUN ARGS .*"),
         (("PRESET=smoke",), r"PRESET: make help takes .*"),
+        (
+            ("train", "JAX_PLATFORMS=cpu"),
+            r"JAX_PLATFORMS: .*; as an environment variable it stands before make: JAX_PLATFORMS=\.\.\. make train",
+        ),
         *(((target, "XYZ=1"), rf"XYZ: make {target} takes .*")
-          for target in ("render", "test", "test-fast", "coverage", "check", "format", "build", "clean", "help")),
+          for target in ("render", "test", "test-fast", "test-oldest", "coverage", "check", "format", "build", "clean",
+                         "help")),
     ],
 )  # fmt: skip
 def test_make_refuses_an_unknown_variable(arguments, unknown):
@@ -106,6 +124,14 @@ def test_make_takes_its_variables():
     assert _make("check", "test", "WORKERS=3").returncode == 0  # what one of several targets takes
     fresh = _make("clean", "check", "UV=uv", "VENV=nowhere").stdout
     assert "uv venv --quiet --seed --python '>=3.11,<3.14' nowhere" in fresh
+
+
+@needs_make
+def test_the_oldest_versions_are_tested_in_an_environment_of_their_own():
+    done = _make("test-oldest", "UV=uv", "ARGS=-x")
+    assert done.returncode == 0, done.stderr
+    assert ".venv-oldest/bin/python -m pytest -m 'not slow' -x" in done.stdout
+    assert "-c constraints-oldest.txt" in done.stdout or (ROOT / ".venv-oldest/.ready").exists()
 
 
 @needs_make

@@ -344,7 +344,7 @@ def solved(robot, recorded):
             [robot.default_qpos],
         ]
     )
-    # Every other random state is lifted or lowered until the fall geoms are a millimetre above or below the floor.
+    # Every other random state is lifted or lowered until the fall geoms are a millimeter above or below the floor.
     close = np.arange(3, 399, 2)
     qpos[close, 2] -= fall_clearances(robot, qpos[close]).min(1) - np.where(close % 4 == 1, 1e-3, -1e-3)
 

@@ -168,6 +168,14 @@ def test_a_reader_that_has_gone_ends_a_command_in_silence():
         os.close(write)
 
 
+def test_a_broken_pipe_that_is_not_the_output_is_shown():
+    """A child process that dies, for example, must not end a command in silence."""
+    broken = "from fmpjax import shell\nwith shell.ending(): raise BrokenPipeError('of a child')"
+    process = _process("-c", broken, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.communicate(timeout=120)[1].endswith("BrokenPipeError: of a child\n")
+    assert process.returncode == 1
+
+
 @pytest.mark.parametrize("program", ["fmpjax", "curvature"])
 def test_windows_is_refused_in_one_sentence(capsys, monkeypatch, program):
     monkeypatch.setattr(sys, "platform", "win32")

@@ -272,7 +272,7 @@ def test_sigterm_saves_and_ends_well(tmp_path):
         if process.poll() is None:
             process.kill()
     assert process.returncode == 0, said
-    assert "stopping after the iterations in hand" in said and "Go on with --resume" in said
+    assert "stopping after the iterations in hand" in said and "Continue with --resume" in said
     saved = Checkpoints(folder).latest()
     assert saved == int(rows(folder)[-1]["iteration"]) >= 4
 
@@ -419,7 +419,7 @@ def test_a_configuration_survives_its_file():
 
 
 @pytest.mark.slow
-def test_a_prior_that_normalises_by_itself_sees_windows_unclipped(walk):
+def test_a_prior_that_normalizes_by_itself_sees_windows_unclipped(walk):
     fmp, amp = (Trainer(tiny(method=method), walk) for method in ("fmp", "amp"))
     far = fmp.env.clip_windows() + 100.0
 
@@ -537,7 +537,7 @@ def test_memory_that_runs_out_leaves_the_last_checkpoint_good(trained, tmp_path,
     with pytest.raises(UserError) as told:
         runs.train(runs.Run.open(folder), resume=True)
     assert "start a run with a smaller env.count (now 8) or prior.bank (now 16)" in str(told.value)
-    assert "the checkpoint of iteration 4 is whole: --resume goes on where there is more memory" in str(told.value)
+    assert "the checkpoint of iteration 4 is whole: --resume continues with more memory" in str(told.value)
     with pytest.raises(SystemExit) as exit_:
         cli.main(["train", "--run", str(folder), "--resume", "--set", "env.count=8"])
     assert exit_.value.code == 2

@@ -72,7 +72,7 @@ def solved(request, reference):
     return actual, reference[case], TOLERANCE[dtype]
 
 
-def centred(x):
+def centered(x):
     return np.asarray(x) - np.mean(x)
 
 
@@ -89,13 +89,13 @@ def test_epsilon_is_the_recorded_one(solved):
 
 def test_score_is_the_recorded_one(solved):
     actual, given, tolerance = solved
-    assert_close(centred(actual.score), given["score_centered"], tolerance)
+    assert_close(centered(actual.score), given["score_centered"], tolerance)
     assert_close(actual.gradient, given["score_gradient"], tolerance)
 
 
 def test_expert_extension_is_the_recorded_one(solved):
     actual, given, tolerance = solved
-    assert_close(centred(actual.expert_extension), given["expert_extension_centered"], tolerance)
+    assert_close(centered(actual.expert_extension), given["expert_extension_centered"], tolerance)
     assert_close(actual.expert_gradient, given["expert_extension_gradient"], tolerance)
 
 
@@ -106,11 +106,11 @@ def test_matching_is_the_recorded_one(solved):
     assert_close(probability, given["match_probability"], tolerance)
     atoms = 1 / (probability**2).sum(-1)
     np.testing.assert_allclose(atoms, given["effective_atoms"], rtol=tolerance)
-    # Norm retention: how much of a velocity's size survives the barycentre, in the mean over queries.
+    # Norm retention: how much of a velocity's size survives the barycenter, in the mean over queries.
     velocity = given["expert_leg_velocity"]
-    barycentre = np.linalg.norm(probability @ velocity, axis=-1).mean()
+    barycenter = np.linalg.norm(probability @ velocity, axis=-1).mean()
     atom = (probability @ np.linalg.norm(velocity, axis=-1)).mean()
-    assert barycentre / atom == pytest.approx(float(given["norm_retention"]), rel=tolerance)
+    assert barycenter / atom == pytest.approx(float(given["norm_retention"]), rel=tolerance)
 
 
 # --- order statistics and epsilon ------------------------------------------------------------------------------------
@@ -221,7 +221,7 @@ def test_convergence_means_that_the_marginals_hold(reference):
     # Each expert atom is matched by its share of the source bank.
     received = np.concatenate([at_source.probability, rest.probability]).mean(0)
     np.testing.assert_allclose(received, 1 / 64, atol=2e-6)
-    # And each source atom: the expert's pull less the score's is the self problem's barycentre, less x.
+    # And each source atom: the expert's pull less the score's is the self problem's barycenter, less x.
     pull = np.concatenate([x.expert_gradient - x.gradient for x in (at_source, rest)])
     np.testing.assert_allclose((pull + source).mean(0), source.mean(0), atol=1e-4)
 
@@ -235,9 +235,9 @@ def test_one_atom_banks_pull_from_the_source_to_the_expert():
     s, y, x = (rng.normal(size=(n, 8)) for n in (1, 1, 40))
     actual = fit(s.repeat(32, 0), y.repeat(24, 0), x)
     np.testing.assert_allclose(actual.gradient, np.broadcast_to(y - s, x.shape), atol=1e-5)
-    np.testing.assert_allclose(centred(actual.score), centred(x @ (y - s)[0]), atol=1e-5)
+    np.testing.assert_allclose(centered(actual.score), centered(x @ (y - s)[0]), atol=1e-5)
     np.testing.assert_allclose(actual.expert_gradient, y - x, atol=1e-5)
-    np.testing.assert_allclose(centred(actual.expert_extension), centred(-0.5 * ((x - y) ** 2).sum(-1)), atol=1e-5)
+    np.testing.assert_allclose(centered(actual.expert_extension), centered(-0.5 * ((x - y) ** 2).sum(-1)), atol=1e-5)
 
 
 def test_two_expert_atoms_and_one_source():
@@ -259,7 +259,7 @@ def test_two_expert_atoms_and_one_source():
     expected = pull + 0.5 * np.tanh(phase)[:, None] * difference
     np.testing.assert_allclose(actual.gradient, expected, atol=2e-4)
     score = epsilon * np.logaddexp(phase, -phase) + x @ pull
-    np.testing.assert_allclose(centred(actual.score), centred(score), atol=1e-4)
+    np.testing.assert_allclose(centered(actual.score), centered(score), atol=1e-4)
 
 
 def plane_bank(seed, count):
@@ -272,7 +272,7 @@ def test_a_translated_bank_pulls_by_the_translation():
     source, query, v = plane_bank(5, 64), plane_bank(6, 32), np.linspace(-0.5, 1, 16)
     actual = fit(source, source + v, query)
     np.testing.assert_allclose(actual.gradient, np.broadcast_to(v, query.shape), atol=1e-4)
-    np.testing.assert_allclose(centred(actual.score), centred(query @ v), atol=1e-4)
+    np.testing.assert_allclose(centered(actual.score), centered(query @ v), atol=1e-4)
 
 
 def test_equal_banks_have_no_score():
@@ -291,7 +291,7 @@ def test_a_common_translation_changes_nothing(reference, distance):
     tolerance = 1e-5 * (1 + distance)  # the inputs themselves are rounded to 1e-7 of the distance
     assert actual.epsilon == pytest.approx(float(given["epsilon"]), rel=tolerance)
     assert_close(actual.gradient, given["score_gradient"], tolerance)
-    assert_close(centred(actual.score), given["score_centered"], tolerance)
+    assert_close(centered(actual.score), given["score_centered"], tolerance)
 
 
 def test_far_banks_stay_finite():

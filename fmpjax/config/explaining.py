@@ -29,7 +29,7 @@ class Setting:
 @functools.cache
 def settings() -> Mapping[str, Setting]:
     """All settings by key, in the order of the sections."""
-    presets = {name: flatten(preset(name)) for name in reversed(PRESETS)}
+    presets = {name: flatten(preset(name)) for name in reversed(tuple(PRESETS))}
     found = {}
     for key in flatten(Config()):
         section, _, field = key.rpartition(".")
@@ -69,7 +69,7 @@ def markdown() -> str:
         *(f"- preset `{name}`: {words}" for name, words in DESCRIPTIONS.items()),
     ]
     for section, sentence in {"": "The run itself.", **sections()}.items():
-        names = " | ".join(reversed(PRESETS))
+        names = " | ".join(reversed(tuple(PRESETS)))
         lines += ["", f"## {section or 'run'}", "", sentence, "", f"| setting | {names} | meaning | values |"]
         lines += ["|" + "---|" * (len(PRESETS) + 3)]
         for setting in settings().values():

@@ -37,7 +37,7 @@ def with_changes(config: Config, changes: Mapping[str, Any]) -> Config:
     """
     for key, value in changes.items():
         section, _, field = key.rpartition(".")
-        target = getattr(config, section, None) if section else config
+        target: Any = getattr(config, section, None) if section else config
         names = [f.name for f in dataclasses.fields(target)] if isinstance(target, Section) else []
         if field not in names or isinstance(getattr(target, field), Section):
             close = difflib.get_close_matches(key, list(flatten(config)), n=1)
@@ -78,12 +78,12 @@ def described(annotation: Any) -> str:
     kind = kinds.type_info(annotation)
     match kind:
         case kinds.LiteralType():
-            return f"one of {', '.join(kind.values)}"
+            return f"one of {', '.join(map(str, kind.values))}"
         case kinds.BoolType():
             return "true or false"
-        case kinds.VarTupleType():
+        case kinds.VarTupleType(item_type=kinds.IntType() | kinds.FloatType() as item):
             least = "one or more " if kind.min_length else ""
-            return f"{least}{_number(kind.item_type)}s{_bounds(kind.item_type)}, with commas between"
+            return f"{least}{_number(item)}s{_bounds(item)}, with commas between"
         case kinds.IntType() | kinds.FloatType():
             return f"a {_number(kind)}{_bounds(kind)}"
     return "text"

@@ -316,7 +316,7 @@ class Config(Section):
     seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 0  # of everything that is random [D]
     precision: Literal["float32", "default"] = "float32"  # of the networks' products [M]; "default": TF32 on NVIDIA
     transitions: PositiveInt = 50_003_968  # budget [P]
-    # shares of the budget at which to evaluate [P]; simulation goes on, where the paper's starts again [D]
+    # shares of the budget at which to evaluate [P]; simulation continues, where the paper's starts again [D]
     evaluations: tuple[Fraction, ...] = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
     evaluation_episodes: PositiveInt = 1024  # first episodes per evaluation [P]
     # rad, deviations of joint angles at an evaluation's starts, ten times that in rad/s; docs/metrics.md [D]

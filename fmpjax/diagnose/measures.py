@@ -39,15 +39,20 @@ def turning(course: Course) -> float:
         return abs(course["eval/demonstration_turn"])
 
 
-def travel(course: Course) -> float | None:
-    """Late speed over the demonstration's; None where most episodes fall, or the demonstration stands."""
-    if fallen(course) > 0.5 or course["eval/demonstration_speed"] < MOVES:
-        return None
+def speed(course: Course) -> float:
+    """Late speed, m/s; that along the robot's own heading where the demonstration turns."""
     try:
         turns = turning(course) > TURNS
     except Missing:  # courses from before turning was measured are of straight walks
         turns = False
-    return course["eval/path_speed" if turns else "eval/late_speed"] / course["eval/demonstration_speed"]
+    return course["eval/path_speed" if turns else "eval/late_speed"]
+
+
+def travel(course: Course) -> float | None:
+    """Late speed over the demonstration's; None where most episodes fall, or the demonstration stands."""
+    if fallen(course) > 0.5 or course["eval/demonstration_speed"] < MOVES:
+        return None
+    return speed(course) / course["eval/demonstration_speed"]
 
 
 def excursion(course: Course, *, travels: bool) -> float | None:

@@ -33,12 +33,22 @@ class Range:
         return f"at most {self.high:g}" if self.low == -math.inf else f"{self.low:g} to {self.high:g}"
 
 
+class _Figures(dict):
+    """The figures that a sentence may name: those of the course, and ``speed``."""
+
+    def __init__(self, course: Course):
+        self._course = course
+
+    def __missing__(self, name: str) -> float:
+        return measures.speed(self._course) if name == "speed" else self._course[name]
+
+
 @dataclasses.dataclass(frozen=True)
 class Rule:
     """A symptom: a figure that leaves its healthy range."""
 
     name: str
-    says: str  # how the sentence begins; figures of the course in braces
+    says: str  # how the sentence begins; figures of the course, or `speed`, in braces
     figure: str  # what is measured
     measure: Callable[[Course], float | None]  # None where the rule does not apply
     healthy: Range
@@ -63,7 +73,7 @@ class Rule:
         mine = [key for key in self.look if reads(course.config.method, key) and settings[key] is not False]
         look = [f"{key} (now {settings[key]})" for key in mine]
         where = " and ".join([", ".join(look[:-1]), look[-1]] if look[1:] else look)
-        says = self.says.format_map(course)
+        says = self.says.format_map(_Figures(course))
         return f"{says}: {self.figure} is {value:.3g}, healthy is {self.healthy}; look at {where}."
 
 
@@ -116,7 +126,7 @@ RULES = (
     ),
     Rule(
         "stands",
-        "It stands, at {eval/late_speed:.2f} m/s where the demonstration goes at {eval/demonstration_speed:.2f}",
+        "It stands, at {speed:.2f} m/s where the demonstration goes at {eval/demonstration_speed:.2f}",
         "excursion",
         lambda course: measures.excursion(course, travels=False),
         Range(low=STEPS),

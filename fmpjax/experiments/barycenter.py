@@ -31,10 +31,10 @@ from fmpjax.viz.panels import Line, Panel
 NAME = "barycenter"
 RESETS = ("dataset", "fixed")
 TARGETS = 2048  # of the first rollout [P]
-REWARD_TOLERANCE = 1e-6  # within which rewards made anew must be the method's own
+REWARD_TOLERANCE = 1e-6  # to which recomputed rewards must equal the method's own
 _SPREAD = ("retention", "target_leg_velocity", "effective_atoms", "target_speed")  # figures with a deviation
 QUANTILES = np.linspace(0.0, 1.0, 41)
-COLOURS = {"dataset": "#2a6fb0", "fixed": "#c8553d"}
+COLORS = {"dataset": "#2a6fb0", "fixed": "#c8553d"}
 PAPER = {
     "dataset": {"retention": 0.130, "effective_atoms": 218.4, "target_speed": 0.851, "reward_difference": 2.1e-7},
     "fixed": {"retention": 0.103, "effective_atoms": 239.7, "target_speed": 0.834, "reward_difference": 2.1e-7},
@@ -112,7 +112,7 @@ def _prior_at(trainer: Trainer, fraction: float) -> priors.MotionPrior:
 def _figures(
     trainer: Trainer, prior: BarycentricState, rollout: priors.Rollout, reward: jax.Array, targets: int, seed: int
 ) -> dict[str, Any]:
-    """Figures of one draw, all made anew in float64 from the windows and the prior's dual."""
+    """Figures of one draw, all recomputed in float64 from the windows and the prior's dual."""
     env, windows = trainer.env, rollout.features
     valid = np.flatnonzero(np.asarray(rollout.valid))
     chosen = np.random.default_rng(seed).choice(valid, targets, replace=False)
@@ -126,7 +126,7 @@ def _figures(
     probability = np.exp(logits - logits.max(-1, keepdims=True))
     probability /= probability.sum(-1, keepdims=True)
     target = probability @ after
-    # Features are standardised coordinates over sqrt(d), of which d / H are the newest frame's: d_g.
+    # Features are standardized coordinates over sqrt(d), of which d / H are the newest frame's: d_g.
     temperature = trainer.config.prior.temperature
     rewards = 2.0 * np.exp(-env.horizon / temperature * ((successor - target) ** 2).sum(-1))
 
@@ -200,7 +200,7 @@ def table(record: Mapping[str, Any]) -> Table:
 
 
 def verdicts(record: Mapping[str, Any]) -> list[Verdict]:
-    """The paper's claims on the barycentre, by our figures."""
+    """The paper's claims on the barycenter, by our figures."""
     resets = record["resets"]
 
     def each(key: str, digits: int = 3) -> str:
@@ -224,7 +224,7 @@ def verdicts(record: Mapping[str, Any]) -> list[Verdict]:
             all(f["target_speed"] > 0.8 * f["bank_speed"] for f in resets.values()),
         ),
         Verdict(
-            "Rewards made anew are the method's own",
+            "Recomputed rewards are the method's own",
             f"they differ by {largest:.1e} at most, their logarithms by {exponent:.1e}",
             largest <= REWARD_TOLERANCE,
         ),
@@ -235,10 +235,10 @@ def figure(record: Mapping[str, Any], path: Path) -> Path:
     """Distributions of the legs' velocity in targets and in what they average, and of the effective atoms."""
     velocity, atoms = {}, {}
     for reset, figures in record["resets"].items():
-        colour, share = COLOURS[reset], QUANTILES.tolist()
-        velocity[f"{reset}: target"] = Line(figures["target_leg_velocity_quantiles"], share, colour)
-        velocity[f"{reset}: matched windows"] = Line(figures["matched_leg_velocity_quantiles"], share, colour, "--")
-        atoms[f"{reset}: target"] = Line(figures["effective_atoms_quantiles"], share, colour)
+        color, share = COLORS[reset], QUANTILES.tolist()
+        velocity[f"{reset}: target"] = Line(figures["target_leg_velocity_quantiles"], share, color)
+        velocity[f"{reset}: matched windows"] = Line(figures["matched_leg_velocity_quantiles"], share, color, "--")
+        atoms[f"{reset}: target"] = Line(figures["effective_atoms_quantiles"], share, color)
     return panels.draw(
         path,
         [

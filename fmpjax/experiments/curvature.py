@@ -1,4 +1,4 @@
-"""The score has a minimum where the barycentre's reward has its maximum (section III-D of the paper, eq. curvature).
+"""The score has a minimum where the barycenter's reward has its maximum (section III-D of the paper, eq. curvature).
 
 Two expert atoms at -a and a on a line, a source between them: halfway, the cross-potential curves by
 -1 + a^2 / epsilon, and rises to either side for every epsilon below a^2; the closeness to the atoms' mean falls to
@@ -43,7 +43,7 @@ def landscapes(distance: float, epsilons: Sequence[float], x: np.ndarray) -> dic
         atoms, middle = jnp.array([[-distance], [distance]]), jnp.zeros(())
         fitted = transport.fit_score(jnp.zeros((1, 1)), atoms, epsilon=epsilon)
         # Both atoms match the middle alike: their mean is the target.
-        target = transport.barycentre(fitted.match_probability(jnp.zeros((1, 1))), atoms)[0, 0]
+        target = transport.barycenter(fitted.match_probability(jnp.zeros((1, 1))), atoms)[0, 0]
         functions = {
             "score": lambda x: fitted.expert_extension(x[None, None])[0][0],
             "barycentric": lambda x: 2.0 * jnp.exp(-((x - target) ** 2)),

@@ -17,7 +17,7 @@ from fmpjax.viz.panels import Line, Panel
 
 NAME = "generalization"
 TITLES = {"fmp": "FMP", "endpoint": "Endpoint", "value": "Value", GROUPS: "Reference groups"}
-COLOURS = {"fmp": "#2a6fb0", "endpoint": "#3a8a6b", "value": "#c8553d", GROUPS: "#5b6673"}
+COLORS = {"fmp": "#2a6fb0", "endpoint": "#3a8a6b", "value": "#c8553d", GROUPS: "#5b6673"}
 PAPER: dict[str, dict[str, float]] = {
     "fmp": {
         "held_out_error": 0.059, "held_out_cosine": 0.937, "end_correlation": 0.979,
@@ -112,11 +112,11 @@ def figure(record: Mapping[str, Any], path: Path) -> Path:
 
     def panel(title: str, key: str, theirs: str = "") -> Panel:
         lines = {
-            TITLES[name]: Line(fractions, figures[key], COLOURS[name], "--" if name == GROUPS else "-", "o")
+            TITLES[name]: Line(fractions, figures[key], COLORS[name], "--" if name == GROUPS else "-", "o")
             for name, figures in record["models"].items()
         }
         for name in record["models"] if theirs else ():
-            lines[f"{TITLES[name]}, the paper's"] = Line([1.0], [PAPER[name][theirs]], COLOURS[name], "", "D", True)
+            lines[f"{TITLES[name]}, the paper's"] = Line([1.0], [PAPER[name][theirs]], COLORS[name], "", "D", True)
         return Panel(title, "fraction of the way to the expert", lines)
 
     return panels.draw(

@@ -40,7 +40,7 @@ _STUDIES: tuple[tuple[str, ModuleType, str], ...] = (
     ("Rewards beyond the rollout that they were fitted on", generalization, _RUNS),
     ("Dynamic against static path supervision", static_teacher, _RUNS),
     ("What a barycentric target keeps of the motion", barycenter, ""),
-    ("Where the score has a minimum and the barycentre its maximum", curvature, ""),
+    ("Where the score has a minimum and the barycenter its maximum", curvature, ""),
 )
 
 
@@ -76,7 +76,7 @@ def _section(
     picture: str,
     read: Callable[[dict[str, Any]], tuple[Table, list[Verdict]]],
 ) -> Section:
-    """The section of the file called ``name`` that lies nearest below ``folder``, with the picture beside it."""
+    """The section of the file called ``name`` that is nearest below ``folder``, with the picture beside it."""
     command = f"fmpjax experiment {module}{needs} --out FOLDER"
     path = min(folder.rglob(name), key=lambda path: (len(path.parts), path), default=None)
     if path is None:
@@ -90,7 +90,7 @@ def _section(
         return section
     except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
         raise UserError(
-            f"{path} is no result of this version ({type(error).__name__}: {error}): write it anew with {command}"
+            f"{path} is no result of this version ({type(error).__name__}: {error}): write it again with {command}"
         ) from None
 
 
@@ -149,7 +149,7 @@ def page(sections: Sequence[Section], videos: Sequence[Path], root: Path) -> str
     ]  # fmt: skip
     for section in sections:
         parts.append(f"<h2>{html.escape(section.title)}</h2>")
-        if section.source is None:
+        if section.table is None:
             parts.append(f"<p>Not measured here; <code>{html.escape(section.command)}</code> does so.</p>")
             continue
         parts += [_html_table(section.table), '<ul class="verdicts">', *map(_html_verdict, section.verdicts), "</ul>"]
@@ -180,7 +180,7 @@ def text(sections: Sequence[Section], videos: Sequence[Path], root: Path, out: P
     parts = [f"# {_TITLE}", _lead(sections)]
     for section in sections:
         parts.append(f"## {section.title}")
-        if section.source is None:
+        if section.table is None:
             parts.append(f"Not measured here; `{section.command}` does so.")
             continue
         parts.append(results.markdown(section.table))
@@ -226,8 +226,9 @@ def _source(section: Section, root: Path, plain: Callable[[str], str], code: Cal
     """Where a section's figures are from."""
     origin = section.provenance
     changes = " with uncommitted changes" if origin.get("uncommitted_changes") else ""
+    file = str(section.source and section.source.relative_to(root))
     return (
-        f"From {code(plain(str(section.source.relative_to(root))))}: {code(plain(origin['command']))}, "
+        f"From {code(plain(file))}: {code(plain(origin['command']))}, "
         f"{plain(origin['date'])}, commit {plain(str(origin['commit'])[:12])}{changes}, {plain(origin['device'])}, "
         f"JAX {plain(origin['packages']['jax'])}."
     )

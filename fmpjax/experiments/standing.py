@@ -9,6 +9,7 @@ the few updates of a rollout follow the transport they are fitted to, and which 
 import csv
 import dataclasses
 import time
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -17,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from jax.flatten_util import ravel_pytree
 
 from fmpjax import features, jsons, physics, potential, ppo, priors, runs
 from fmpjax.config import Config, preset
@@ -86,7 +88,7 @@ def gather(trainer: Trainer, state: TrainState, key: jax.Array) -> Moments:
     return Moments(windows, pushed, speed, reward, jnp.full_like(reward, reward.mean()), batch)
 
 
-def behaviours(moments: Moments, discounts=(0.97, 0.99)) -> dict[str, float]:
+def behaviors(moments: Moments, discounts=(0.97, 0.99)) -> dict[str, float]:
     """Share, mean reward, fall hazard and resulting return of the standing and of the walking moments."""
     speed, reward = np.asarray(moments.speed), np.asarray(moments.reward)
     fell, cut = np.asarray(moments.batch.fell), np.asarray(moments.batch.timed_out)
@@ -107,13 +109,13 @@ def behaviours(moments: Moments, discounts=(0.97, 0.99)) -> dict[str, float]:
         row[f"{name}_reward"] = reward[chosen].mean() if chosen.sum() >= 100 else np.nan
         row[f"{name}_falls_in_1s"] = within
         for discount in discounts:
-            # Of somebody who goes on so for ever: reward each step, a fall ends it.
+            # Of a robot that continues like this: a reward at each step, until a fall.
             row[f"{name}_return_{discount}"] = row[f"{name}_reward"] / (1.0 - discount * (1.0 - hazard))
     return {name: float(value) for name, value in row.items()}
 
 
 def _returns(reward, batch: ppo.Batch, discount: float):
-    """Discounted returns ``[T, N]``; time-outs and the last step go on at the mean reward for ever."""
+    """Discounted returns ``[T, N]``; after a time-out and after the last step the mean reward continues without end."""
     value = jnp.full_like(reward, reward.mean() / (1.0 - discount))
     return ppo.generalized_advantage(reward, value, value, batch.fell, batch.timed_out, discount, 1.0) + value
 
@@ -134,7 +136,7 @@ def gradients(trainer: Trainer, state: TrainState, moments: Moments) -> dict[str
             log_probability = -0.5 * ((batch.action - mean) / deviation) ** 2 - jnp.log(deviation)
             return jnp.mean(jnp.clip(gain, -4, 4) * log_probability.sum(-1))
 
-        return jax.flatten_util.ravel_pytree(jax.grad(surrogate)(state.ppo.actor))[0]
+        return ravel_pytree(jax.grad(surrogate)(state.ppo.actor))[0]
 
     def per_rollout(reward, value, next_value):
         split = jax.tree.map(
@@ -248,14 +250,14 @@ def _examine(trainer: Trainer, state: TrainState, key: jax.Array) -> tuple[Momen
 
 
 def examine(trainer: Trainer, state: TrainState, seed: int) -> dict[str, float]:
-    """All figures of one state: behaviours, gradients, fits."""
+    """All figures of one state: behaviors, gradients, fits."""
     done = int(state.iteration) * trainer.config.transitions_per_iteration
     moments, rest = _examine(trainer, state, jax.random.fold_in(jax.random.PRNGKey(seed), done))
     row = {"transitions": done, "cap": float(state.env.cap), "speed": float(moments.speed.mean())}
-    return row | behaviours(moments) | {name: float(value) for name, value in rest.items()}
+    return row | behaviors(moments) | {name: float(value) for name, value in rest.items()}
 
 
-def _write(path: Path, rows: list[dict[str, float]]) -> None:
+def _write(path: Path, rows: Sequence[Mapping[str, float | str]]) -> None:
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
@@ -282,7 +284,7 @@ def look(run: tuple[Path, ...], out: Path) -> None:
     print(f"wrote {out}")
 
 
-def track(trainer: Trainer) -> dict[str, float]:
+def track(trainer: Trainer) -> dict[str, float | str]:
     """Whether the servos can follow the demonstration at all: its joints as targets, the root carried along or free.
 
     Returns:

@@ -17,7 +17,7 @@ from fmpjax.viz.panels import Line, Panel
 
 NAME = "static_teacher"
 TITLES = {"fmp": "dynamic (FMP)", "static": "static", GROUPS: "reference groups"}
-COLOURS = {"fmp": "#2a6fb0", "static": "#a3623a", GROUPS: "#5b6673"}
+COLORS = {"fmp": "#2a6fb0", "static": "#a3623a", GROUPS: "#5b6673"}
 # The paper does not give the errors at 0.75 in numbers.
 PAPER: dict[str, dict[str, float]] = {
     "fmp": {
@@ -110,7 +110,7 @@ def figure(record: Mapping[str, Any], path: Path) -> Path:
 
     def panel(title: str, key: str) -> Panel:
         lines = {
-            TITLES[name]: Line(fractions, figures[key], COLOURS[name], "--" if name == GROUPS else "-", "o")
+            TITLES[name]: Line(fractions, figures[key], COLORS[name], "--" if name == GROUPS else "-", "o")
             for name, figures in record["models"].items()
         }
         for name, figures in PAPER.items():
@@ -119,7 +119,7 @@ def figure(record: Mapping[str, Any], path: Path) -> Path:
                 given = known, [figures[f"increment_{f:g}"] for f in known]
             else:
                 given = [1.0], [figures["end_cosine"]]
-            lines[f"{TITLES[name]}, the paper's"] = Line(*given, COLOURS[name], "", "D", True)
+            lines[f"{TITLES[name]}, the paper's"] = Line(*given, COLORS[name], "", "D", True)
         return Panel(title, "fraction of the way to the expert", lines)
 
     return panels.draw(

@@ -112,7 +112,7 @@ def record(
     if frames is None or len(rows) == len(recording.qpos):
         return file, recording
     first, last = span(frames, len(recording.qpos))
-    fact = Fact("rows", f"{first} to {last} of {len(recording.qpos)}", "--frames")
+    fact = Fact("rows", f"{first} to {last} of {len(recording.qpos)}", "as asked")
     reading = recording.reading._replace(facts=(*recording.reading.facts, fact))
     return file, recording._replace(qpos=rows, reading=reading)
 

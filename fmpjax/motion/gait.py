@@ -114,7 +114,11 @@ class Gait:
     def said(self) -> str:
         """The chosen numbers in words."""
         if not self.chosen:
-            return "the robot's own style but for the given numbers"
+            said, own = "the robot's own style but for the given numbers", OPEN.on(self.robot).cadence
+            fitting = fitted(self.robot, self.command).cadence
+            if self.style.cadence != own or math.isclose(own, fitting, rel_tol=0.05):
+                return said
+            return f"{said}: its cadence is {own:.4g} steps/s, where {fitting:.4g} fits the speed (--style.cadence)"
         return "chosen: " + ", ".join(f"{name} {getattr(self.style, name) + 0.0:.4g}" for name in self.chosen)
 
 

@@ -14,6 +14,7 @@ from fmpjax.motion.clip import MotionClip
 from fmpjax.motion.formats import load
 
 SUFFIXES = (".npz", ".npy", ".csv", ".txt", ".json", ".pkl", ".pt")  # of the files of a folder that are motions
+NAMED = 4  # motions at most of which a line shows the names
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -130,6 +131,14 @@ def listed(names: str) -> str:
         parts = [f"{name}/{path.stem}" if names_shipped else str(path) for path in files]
         entries += [f"{part}:{weight / len(files):.6g}" for part in parts]
     return ",".join(entries)
+
+
+def briefly(names: str) -> str:
+    """A list of motions in a line: as it is, or the number of them and the first names where they are many."""
+    entries = parse(names)
+    if len(entries) <= NAMED:
+        return f"motion {names}"
+    return f"{len(entries)} motions: {', '.join(name for name, _ in entries[:NAMED])} and {len(entries) - NAMED} more"
 
 
 def describe(name: str) -> str:

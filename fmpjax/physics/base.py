@@ -9,7 +9,7 @@ from fmpjax.physics.traits import Traits
 
 
 class PhysicsState(NamedTuple):
-    """Physical state of N robots; all that a backend needs to go on."""
+    """Physical state of N robots; a backend needs nothing else to continue."""
 
     qpos: jax.Array  # [N, 7 + J] root xyz m, root quaternion wxyz, joints rad
     qvel: jax.Array  # [N, 6 + J] root velocity (world) m/s, angular velocity (body) rad/s, joints rad/s

@@ -116,7 +116,7 @@ def _handle(frame, function: Function) -> int | None:
         return None
     try:
         function(_array(frame.arguments), _array(frame.results))
-    except BaseException as error:  # an exception would be printed, and the program go on with what is in memory
+    except BaseException as error:  # XLA would print an exception and continue with what is in memory
         said = f"{type(error).__name__}: {error}".encode()
         arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, said, _INTERNAL)
         return frame.api.contents.error_create(ctypes.addressof(arguments))

@@ -53,7 +53,7 @@ def descriptions() -> dict[str, str]:
 
 
 def normalizes(method: str) -> bool:
-    """Whether the prior called ``method`` normalises windows itself, and so takes them unclipped."""
+    """Whether the prior called ``method`` normalizes windows itself, and so takes them unclipped."""
     return method in _OWN_NORMALIZER
 
 

@@ -150,7 +150,8 @@ def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
         return z * multiplicity
 
     def apply(params, x):
-        return net.apply(params, x)[..., 0]
+        output: Any = net.apply(params, x)
+        return output[..., 0]
 
     def init(key):
         params = net.init(key, jnp.zeros((1, size)))
@@ -165,14 +166,14 @@ def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
 
     def fit(state: State, pool, scores, key):
         order_key, seen_key, replay_key, store_key = jax.random.split(key, 4)
-        replay = store(state.replay, pool, settings.replay_new, store_key) if settings.replay else None
+        replay = None if state.replay is None else store(state.replay, pool, settings.replay_new, store_key)
 
         def step(carry, inputs):
             params, optimizer_state = carry
             rows, key = inputs
             agent_key, expert_key = jax.random.split(key)
             agent = sharding.split(pool[rows])
-            if settings.replay:
+            if replay is not None:
                 old = replay.windows[jax.random.randint(agent_key, rows.shape, 0, replay.count)].astype(pool.dtype)
                 agent = jnp.concatenate([agent, old])
             agent = normalize(state.normalizer, agent)
@@ -196,7 +197,7 @@ def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
         normalizer = update_normalizer(state.normalizer, pool / expert.weight, seen / expert.weight)
         summary = {name: values.mean() for name, values in stats.items()} | {"skipped": stats["skipped"].sum()}
         summary |= learning.score_metrics(*learning.median_and_spread(scores), score(state, expert.windows))
-        if settings.replay:
+        if replay is not None:
             summary["replayed"] = replay.count.astype(jnp.float32)
         return State(params, optimizer_state, normalizer, replay), summary
 

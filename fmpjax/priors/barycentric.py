@@ -62,7 +62,7 @@ def target(state: BarycentricState, condition: jax.Array) -> tuple[jax.Array, ja
     """Barycentric targets ``[n, F]`` of conditions ``[n, C]``, and the matching probabilities ``[n, m]``."""
     cost = transport.squared_cost(condition, state.condition)
     _, probability = transport.extension(cost, state.dual, state.epsilon)
-    return transport.barycentre(probability, state.successor), probability
+    return transport.barycenter(probability, state.successor), probability
 
 
 def make(expert: Expert, config: Config) -> MotionPrior:
@@ -71,7 +71,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
     Its temperature is ``config.prior.temperature``.
     """
     settings = config.prior
-    # Features are standardised coordinates times weight; d_g counts those of one full frame.
+    # Features are standardized coordinates times weight; d_g counts those of one full frame.
     per_frame = expert.dimension / expert.horizon
     scale = expert.dimension / (per_frame * settings.temperature)
 

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from fmpjax import learning, sharding, transport
 from fmpjax.config import PriorConfig
@@ -26,7 +27,7 @@ class Expert(NamedTuple):
 
     windows: jax.Array  # [W, D] every window
     dimension: float  # d, coordinates of the full features that the D stand for
-    weight: jax.Array  # [D] feature of a standardised coordinate: root of its multiplicity over sqrt(d)
+    weight: jax.Array  # [D] feature of a standardized coordinate: root of its multiplicity over sqrt(d)
     horizon: int  # frames in a window, oldest first, D / horizon coordinates each
     share: jax.Array | None = None  # [W] how often each window is drawn, summing to one; evenly where None
 
@@ -58,10 +59,10 @@ class MotionPrior(NamedTuple):
 
     init: Callable[[jax.Array], PriorState]
     update: Callable[[PriorState, Rollout, jax.Array], tuple[PriorState, jax.Array, Metrics]]
-    score: Callable[[PriorState, jax.Array], jax.Array]  # of features [n, D], higher is better, before normalisation
+    score: Callable[[PriorState, jax.Array], jax.Array]  # of features [n, D], higher is better, before normalization
 
 
-def flatten(rollout: Rollout, stand_in: jax.Array) -> jax.Array:
+def flatten(rollout: Rollout, stand_in: Float[jax.Array, " D"]) -> Float[jax.Array, "N D"]:
     """All windows of a rollout, ``[T * N, D]``; ``stand_in [D]`` takes the place of those that are not finite."""
     features = jnp.where(rollout.valid[..., None], rollout.features, stand_in)
     return sharding.split(features.reshape(-1, features.shape[-1]))
@@ -76,7 +77,12 @@ class Coupling(NamedTuple):
     solution: transport.Solve
 
 
-def couple(source: jax.Array, expert: jax.Array, dimension: jax.Array | float, config: PriorConfig) -> Coupling:
+def couple(
+    source: Float[jax.Array, "n D"],
+    expert: Float[jax.Array, "m D"],
+    dimension: jax.Array | float,
+    config: PriorConfig,
+) -> Coupling:
     """Transport of a source bank ``[n, D]`` to the expert bank ``[m, D]`` and to itself."""
     cross, itself = transport.squared_cost(source, expert), transport.squared_cost(source, source)
     epsilon = transport.entropy_coefficient(cross, dimension, config.epsilon_fraction)
@@ -87,9 +93,13 @@ def couple(source: jax.Array, expert: jax.Array, dimension: jax.Array | float, c
 
 
 def couple_draws(
-    keys: jax.Array, pool: jax.Array, expert: jax.Array, dimension: jax.Array | float, config: PriorConfig
+    keys: jax.Array,
+    pool: Float[jax.Array, "N D"],
+    expert: Float[jax.Array, "m D"],
+    dimension: jax.Array | float,
+    config: PriorConfig,
 ) -> Coupling:
-    """Source banks drawn from a pool ``[N, D]``, one a key ``[k]``, and the transport of each, ``[k, ...]``.
+    """Source banks drawn from a pool ``[N, D]``, one per key ``[k]``, and the transport of each, ``[k, ...]``.
 
     No solve depends on another, nor on what is fitted to it: devices share them, and an accelerator, which waits for
     launches rather than for arithmetic, solves its own at once.
@@ -101,14 +111,14 @@ def couple_draws(
 
 
 class Reward(NamedTuple):
-    """A reward and the statistics that normalised it."""
+    """A reward and the statistics that normalized it."""
 
     reward: jax.Array  # [T, N]
     median: jax.Array
     spread: jax.Array  # interquartile range
 
 
-def median_reward(score: jax.Array, valid: jax.Array, spread_floor: float) -> Reward:
+def median_reward(score: Float[jax.Array, "*shape"], valid: Bool[jax.Array, "*shape"], spread_floor: float) -> Reward:
     """Reward 2 sigmoid((S - median) / max(IQR, floor)) over the rollout's valid windows (eq. reward), 0 elsewhere."""
     median, spread = learning.median_and_spread(jnp.where(valid, score, jnp.nan), jnp.nanquantile)
     reward = 2.0 * jax.nn.sigmoid((score - median) / jnp.maximum(spread, spread_floor))

@@ -1,6 +1,6 @@
 """16-bank score: the average of transport scores of fresh source banks, with no network (section IV-A of the paper).
 
-It tests what the neural potential adds: the reward is the teacher's own average, normalised as FMP's is.
+It tests what the neural potential adds: the reward is the teacher's own average, normalized as FMP's is.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,8 @@
 """Flow-Matched Motion Prior: the transport potential fitted online (sections III-C and III-D of the paper).
 
-Every update has a source bank drawn from the rollout, its transport to the expert bank and to itself, and takes one
-Adam step on three losses: the centred value of the score, its gradient, and the flow along rollout-to-expert paths. The
-average of the updates' parameters then scores every window.
+An update draws a source bank from the rollout, solves its transport to the expert bank and to itself, and takes one
+Adam step on three losses: the centered value of the score, its gradient, and the flow along rollout-to-expert paths.
+The average of the updates' parameters then scores every window.
 """
 
 import dataclasses
@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Float
 
 from fmpjax import learning, potential, sharding, transport
 from fmpjax.config import Config, PriorConfig
@@ -44,7 +45,7 @@ class Teacher(NamedTuple):
     solution: transport.Solve
 
 
-def teach(coupling: Coupling, expert: jax.Array, query: jax.Array | None) -> Teacher:
+def teach(coupling: Coupling, expert: Float[jax.Array, "m D"], query: Float[jax.Array, "q D"] | None) -> Teacher:
     """Read score, gradient and matching probabilities of a solved source bank at the queries.
 
     Args:
@@ -62,7 +63,7 @@ def teach(coupling: Coupling, expert: jax.Array, query: jax.Array | None) -> Tea
     return Teacher(
         score=expert_value - source_value,
         # The -x of the two gradients cancels.
-        gradient=transport.barycentre(to_expert, expert) - transport.barycentre(to_source, source),
+        gradient=transport.barycenter(to_expert, expert) - transport.barycenter(to_source, source),
         to_expert=to_expert,
         to_source=to_source,
         solution=solution,
@@ -78,13 +79,21 @@ class Flow(NamedTuple):
     velocity: jax.Array  # [q, D] z - x
 
 
-def pick(draw: jax.Array, probability: jax.Array, targets: jax.Array) -> jax.Array:
+def pick(
+    draw: Float[jax.Array, " q"], probability: Float[jax.Array, "q m"], targets: Float[jax.Array, "m D"]
+) -> Float[jax.Array, "q D"]:
     """Targets ``[q, D]`` by probabilities ``[q, m]`` over ``targets [m, D]`` and uniform numbers ``draw [q]``."""
     index = (jnp.cumsum(probability, axis=-1) < draw[:, None]).sum(-1)
     return targets[jnp.minimum(index, len(targets) - 1)]
 
 
-def sample_flow(key, query, teacher: Teacher, source, expert) -> Flow:
+def sample_flow(
+    key: jax.Array,
+    query: Float[jax.Array, "q D"],
+    teacher: Teacher,
+    source: Float[jax.Array, "n D"],
+    expert: Float[jax.Array, "m D"],
+) -> Flow:
     """Draw a head, a target atom by that head's probabilities, and a flow time for each query (eq. flow)."""
     head_key, atom_key, tau_key = jax.random.split(key, 3)
     head = jax.random.randint(head_key, query.shape[:1], 0, potential.HEADS)

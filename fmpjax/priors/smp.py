@@ -116,7 +116,8 @@ def make(expert: Expert, config: Config) -> MotionPrior:
             noise = jax.random.normal(noise_key, x.shape)
 
             def loss(params):
-                return jnp.abs(network.apply(params, noised(x, noise, left[at][:, None]), at) - noise).mean()
+                found: Any = network.apply(params, noised(x, noise, left[at][:, None]), at)
+                return jnp.abs(found - noise).mean()
 
             value, gradients = jax.value_and_grad(loss)(state.params)
             taken = learning.step_if_finite(optimizer, state.params, state.optimizer, value, gradients)

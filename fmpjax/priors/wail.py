@@ -66,7 +66,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         deviation = jnp.maximum(jnp.sqrt(variance), settings.deviation_floor)
         reward = jnp.where(known, 2.0 * jax.nn.sigmoid((grid - mean) / deviation), 0.0)
         fitted, summary = critic.fit(state.critic, pool, values, key)
-        summary |= {"reward_deviation": deviation}
+        summary = {**summary, "reward_deviation": deviation}
         return WAILState(fitted, variance, state.rollouts + 1), reward, summary
 
     return MotionPrior(init, update, lambda state, x: critic.score(state.critic, x))

@@ -88,7 +88,9 @@ class Run:
         run = cls(folder)
         library = load_motion(config)
         if (run.folder / "config.json").exists():
-            raise UserError(f"run folder {run.folder} holds a run already: go on with --resume, or name another --run")
+            raise UserError(
+                f"run folder {run.folder} holds a run already: continue with --resume, or name another --run"
+            )
         try:
             run.folder.mkdir(parents=True, exist_ok=True)
             for clip, path in zip(library.clips, run._demonstration_files(len(library.clips)), strict=True):
@@ -124,7 +126,7 @@ class Run:
         self._trainer = None
 
     def resumed(self) -> None:
-        """Say in the provenance that this process goes on with the run."""
+        """Say in the provenance that this process continues the run."""
         made, here = self.provenance(), provenance()
         again = {key: here[key] for key in ("command", "date", "commit", "uncommitted_changes", "device")}
         made |= {"resumed": [*made.get("resumed", []), again]}
@@ -166,7 +168,7 @@ class Run:
         return [self.folder / f"demonstration{f'-{i + 1}' if i else ''}.npz" for i in range(count)]
 
     def _demonstration(self, config: Config) -> motion.MotionLibrary:
-        """The clips as the folder holds them, whoever asks: the first process and a resumed one see the same bits."""
+        """The clips as the folder holds them: the first process and a resumed one see the same bits."""
         motions = self.motions(config)
         clips = [
             dataclasses.replace(

@@ -53,7 +53,7 @@ class Recorder:
         """Write a row, and what is due with it.
 
         Args:
-          at: where the training stands.
+          at: the training's clock.
           row: the metrics.
           state: what to save, in this process's memory; None where no save is due.
           evaluate: evaluate ``state``, and keep it where it is the best so far.
@@ -61,6 +61,7 @@ class Recorder:
         if not evaluate:
             self._write(at, row, state)
             return
+        assert state is not None, "an evaluation needs the state"
         evaluation, self.evaluated = self._evaluate(state.ppo), at.done
         self._note(f"evaluation at {at.transitions:,} transitions, {self._label}{clock(at.seconds)}:")
         self._note(table(evaluation))
@@ -84,7 +85,7 @@ class Recorder:
     def _write(self, at: Clock, row: Mapping[str, float], state: TrainState | None, *, better: bool = False) -> None:
         # Rows ahead of their checkpoint are computed again after a kill; rows behind it would be missing.
         self.log.write(at.done, at.transitions, at.seconds, row)
-        if better:
-            self.save(state, best=True)
         if state is not None:
+            if better:
+                self.save(state, best=True)
             self.save(state)

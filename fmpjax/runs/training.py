@@ -3,13 +3,14 @@
 import contextlib
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 
 import numpy as np
 
 from fmpjax import evaluate, memory, sharding
 from fmpjax.errors import UserError, out_of_memory
 from fmpjax.logs import Progress, clock
+from fmpjax.motion import library
 from fmpjax.provenance import machine
 from fmpjax.runs.clock import Clock, End
 from fmpjax.runs.folder import Run
@@ -41,11 +42,11 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
     config, began = group[0].config, time.monotonic()
     progress.note(
         f"run {', '.join(str(run.folder) for run in group)}: {config.method}, {config.preset}, {config.env.reset} "
-        f"reset, motion {config.motion}"
+        f"reset, {library.briefly(config.motion)}"
     )
     session = Session(group, resume=resume)
     if session.done >= config.iterations:
-        progress.note(f"the budget of {config.transitions:,} transitions is spent: a larger --transitions would go on")
+        progress.note(f"the budget of {config.transitions:,} transitions is spent: a larger --transitions continues")
         return End.BUDGET
     if session.done and sharding.primary():
         for run in group:
@@ -66,7 +67,7 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
     for recorder in recorders:
         recorder.close()
     if end is not End.BUDGET:
-        progress.note(f"{end.value} at {training.transitions:,} transitions; saved. Go on with --resume.")
+        progress.note(f"{end.value} at {training.transitions:,} transitions; saved. Continue with --resume.")
     return end
 
 
@@ -168,10 +169,13 @@ class StopSignals:
 
 
 @contextlib.contextmanager
-def held(group: Sequence[Run]) -> Iterator[None]:
+def held(group: Sequence[Run]) -> Generator[None]:
     """Keep other processes from training in the run folders; a process that ends, however, lets go of them."""
+    if fcntl is None or not sharding.primary():
+        yield
+        return
     with contextlib.ExitStack() as held:
-        for run in group if fcntl and sharding.primary() else ():
+        for run in group:
             try:
                 lock = held.enter_context((run.folder / ".lock").open("w"))
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -183,7 +187,7 @@ def held(group: Sequence[Run]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def enough_memory(group: Sequence[Run]) -> Iterator[None]:
+def enough_memory(group: Sequence[Run]) -> Generator[None]:
     """Say what to change where memory runs out."""
     try:
         yield
@@ -196,6 +200,6 @@ def enough_memory(group: Sequence[Run]) -> Iterator[None]:
         saved = set.intersection(*(run.checkpoints.iterations() for run in group))
         kept = ""
         if saved:
-            kept = f"; the checkpoint of iteration {max(saved):,} is whole: --resume goes on where there is more memory"
+            kept = f"; the checkpoint of iteration {max(saved):,} is whole: --resume continues with more memory"
             kept += ", or with some of the seeds" if len(group) > 1 else ""
         raise UserError(f"out of memory on {machine()}: start a run with a smaller {less}{kept}") from error

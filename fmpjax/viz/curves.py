@@ -33,8 +33,8 @@ TITLES = {
 }
 COLUMNS = 4
 SPARSE = 0.5  # a curve with values in fewer rows than this is drawn as points
-COLOURS = {"train": "#2a6fb0", "eval": "#c8553d", "fit": "#3a8a6b", "ppo": "#7a5ba6"}
-OTHER_COLOUR = "#5b6673"
+COLORS = {"train": "#2a6fb0", "eval": "#c8553d", "fit": "#3a8a6b", "ppo": "#7a5ba6"}
+OTHER_COLOR = "#5b6673"
 
 
 def learning_curves(csv_path: str | Path, png_path: str | Path) -> Path:
@@ -75,7 +75,7 @@ def learning_curves(csv_path: str | Path, png_path: str | Path) -> Path:
 def comparison(
     png_path: str | Path, tables: Mapping[str, str | Path], panels: Mapping[str, Sequence[str]], columns: int = 4
 ) -> Path:
-    """Draw columns of several tables over their transitions, a colour for each table; returns the PNG's path.
+    """Draw columns of several tables over their transitions, a color for each table; returns the PNG's path.
 
     Args:
       png_path: picture to write.
@@ -120,14 +120,14 @@ def comparison(
 
 
 def _draw(panel, name: str, across: np.ndarray, values: np.ndarray) -> None:
-    colour = COLOURS.get(name.split("/")[0], OTHER_COLOUR)
+    color = COLORS.get(name.split("/")[0], OTHER_COLOR)
     known = np.isfinite(values)
     x, y = across[known], values[known]
     if known.mean() < SPARSE or len(y) < 3:
-        panel.plot(x, y, color=colour, linewidth=1.2, marker="o", markersize=3.5)
+        panel.plot(x, y, color=color, linewidth=1.2, marker="o", markersize=3.5)
     else:
-        panel.plot(x, y, color=colour, linewidth=0.7, alpha=0.35)
-        panel.plot(x, _running_mean(y, max(1, len(y) // 50)), color=colour, linewidth=1.6)
+        panel.plot(x, y, color=color, linewidth=0.7, alpha=0.35)
+        panel.plot(x, _running_mean(y, max(1, len(y) // 50)), color=color, linewidth=1.6)
     panel.set_title(TITLES[name], fontsize=9, loc="left")
     panel.tick_params(labelsize=7, length=2)
     panel.grid(alpha=0.25, linewidth=0.5)
@@ -136,7 +136,7 @@ def _draw(panel, name: str, across: np.ndarray, values: np.ndarray) -> None:
 
 
 def _running_mean(y: np.ndarray, half: int) -> np.ndarray:
-    """Mean of ``y [n]`` over ``half`` neighbours on either side, fewer at the ends."""
+    """Mean of ``y [n]`` over ``half`` neighbors on either side, fewer at the ends."""
     total = np.concatenate([[0.0], np.cumsum(y)])
     low = np.maximum(np.arange(len(y)) - half, 0)
     high = np.minimum(np.arange(len(y)) + half + 1, len(y))

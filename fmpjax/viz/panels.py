@@ -15,7 +15,7 @@ class Line(NamedTuple):
 
     x: Sequence[float]
     y: Sequence[float]
-    colour: str
+    color: str
     style: str = "-"  # as matplotlib has them; "" for markers alone
     marker: str = ""
     hollow: bool = False  # markers with white inside
@@ -42,8 +42,8 @@ def draw(path: Path, panels: Sequence[Panel], *, width: float = 3.6, height: flo
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         for label, line in panel.lines.items():
             (handles[label],) = axes.plot(
-                line.x, line.y, linestyle=line.style or "none", color=line.colour, marker=line.marker, linewidth=1.5,
-                markersize=5, markerfacecolor="white" if line.hollow else line.colour, zorder=3 if line.hollow else 2,
+                line.x, line.y, linestyle=line.style or "none", color=line.color, marker=line.marker, linewidth=1.5,
+                markersize=5, markerfacecolor="white" if line.hollow else line.color, zorder=3 if line.hollow else 2,
             )  # fmt: skip
         axes.set_title(panel.title, fontsize=9, loc="left")
         axes.set_xlabel(panel.across, fontsize=8)

@@ -43,7 +43,7 @@ def render_frames(
       width: pixels.
       height: pixels.
       ghost: ``[T, 7 + J]``, a second motion drawn as a translucent robot.
-      follow: move the camera with the root, smoothly; otherwise it stands still and sees the whole path.
+      follow: move the camera with the root, smoothly; otherwise it is fixed and sees the whole path.
       labels: a caption, or one per frame.
       using: one of `BACKENDS` instead of the one that `backend` finds.
 
@@ -134,13 +134,13 @@ def _camera_path(robot: Robot, root: np.ndarray, aspect: float, follow: bool) ->
     """
     narrow = max(1.0, 0.8 / aspect)  # a tall pane steps back until a stride fits
     if follow:
-        centre = gaussian_filter1d(root, SMOOTHING, axis=0, mode="nearest")
+        center = gaussian_filter1d(root, SMOOTHING, axis=0, mode="nearest")
         distance = robot.view_distance * narrow
     else:
         span = np.ptp(root, axis=0)
-        centre = np.broadcast_to(root.min(0) + span / 2, root.shape)
+        center = np.broadcast_to(root.min(0) + span / 2, root.shape)
         distance = robot.view_distance * narrow + 1.2 * float(np.linalg.norm(span)) / max(aspect, 1.0)
-    return np.column_stack([centre, np.full(len(root), robot.view_height)]), distance
+    return np.column_stack([center, np.full(len(root), robot.view_height)]), distance
 
 
 def _captioned(image: np.ndarray, text: str) -> np.ndarray:

@@ -28,7 +28,7 @@ def drawing(robot: Robot, width: int, height: int, distance: float) -> Generator
     axes.set_axis_off()
     tall = 0.8 * distance  # m, what a picture shows from bottom to top
     wide = tall * width / height
-    points_per_metre = 72 * height / PLOT_DPI / tall
+    points_per_meter = 72 * height / PLOT_DPI / tall
     size = robot.view_distance / 2.4  # the thickness of bones below is for this distance
     axes.axhspan(-tall, FLOOR_DEPTH * SHIFT[1], color="#dbe1e7", linewidth=0, zorder=0)
     marks = LineCollection([], colors="#bcc6d0", linewidths=1, zorder=1)
@@ -38,10 +38,10 @@ def drawing(robot: Robot, width: int, height: int, distance: float) -> Generator
     def picture(configurations: list[np.ndarray], look: np.ndarray) -> np.ndarray:
         axes.set_xlim(look[0] - wide / 2, look[0] + wide / 2)
         axes.set_ylim(look[2] - tall / 2, look[2] + tall / 2)
-        # A mark across the floor every half metre shows the motion: the view moves with the robot.
-        metres = np.arange(np.floor(look[0] - wide), look[0] + wide, 0.5)
+        # A mark across the floor every half meter shows the motion: the view moves with the robot.
+        meters = np.arange(np.floor(look[0] - wide), look[0] + wide, 0.5)
         across = np.array([-tall / SHIFT[1], FLOOR_DEPTH])[:, None] * SHIFT
-        marks.set_segments([across + (x, 0.0) for x in metres])
+        marks.set_segments([across + (x, 0.0) for x in meters])
         drawn = []
         for ghostly, qpos in enumerate(configurations):
             tones = np.array(TONES[bool(ghostly)])
@@ -50,7 +50,7 @@ def drawing(robot: Robot, width: int, height: int, distance: float) -> Generator
                 LineCollection(
                     list(segments),
                     colors=tones[bones.tone],
-                    linewidths=0.045 * size * points_per_metre,
+                    linewidths=0.045 * size * points_per_meter,
                     capstyle="round",
                     zorder=3 - ghostly,
                 ),

@@ -99,7 +99,7 @@ def _write_mp4(encoder, path: Path, frames: np.ndarray, fps: float) -> None:
 
 def _write_gif(path: Path, frames: np.ndarray, fps: float) -> None:
     every = int(np.ceil(fps / GIF_FPS))
-    # One palette for all frames, from the first and the last, keeps the colours from flickering.
+    # One palette for all frames, from the first and the last, keeps the colors from flickering.
     palette = Image.fromarray(np.concatenate([frames[0], frames[-1]])).quantize(255)
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames[::every]]
     # The format counts in 10 ms: rounding the times, not the durations, keeps the speed right.

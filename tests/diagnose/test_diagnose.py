@@ -183,6 +183,8 @@ def test_where_the_demonstration_turns_the_pace_is_along_the_own_heading():
     turning = dict(demonstration_turn=0.5, demonstration_turning=0.5, turn=0.5, late_speed=-0.4)
     assert not diagnose.symptoms(course(**turning))
     assert list(diagnose.symptoms(course(**turning, path_speed=2.0))) == ["too fast"]
+    standing = diagnose.symptoms(course(**turning, path_speed=0.02, excursion=0.1))["stands"]
+    assert standing.startswith("It stands, at 0.02 m/s where the demonstration goes at 1.00")
 
 
 def test_left_and_right_turns_that_cancel_are_not_judged():

@@ -167,7 +167,7 @@ def test_updates_are_whole_blocks(updates):
         offline.size(updates, False)
 
 
-# --- barycentre and curvature ----------------------------------------------------------------------------------------
+# --- barycenter and curvature ----------------------------------------------------------------------------------------
 
 
 def test_retention_of_opposite_and_of_equal_velocities():
@@ -237,7 +237,7 @@ def test_curvature_is_its_closed_form():
     found = curvature.landscapes(0.7, (0.1, 0.49, 2.0), np.array([-0.7, 0.0, 0.7]))
     np.testing.assert_allclose(found["score_curvature"], -1 + 0.49 / np.array([0.1, 0.49, 2.0]), atol=1e-10)
     np.testing.assert_allclose(found["barycentric_curvature"], -4.0, atol=1e-10)
-    # Below a^2 the atoms are better than the middle for the score, for the barycentre never.
+    # Below a^2 the atoms are better than the middle for the score, for the barycenter never.
     assert found["score"][0, 0] == pytest.approx(found["score"][0, 2]) and found["score"][0, 0] > 0
     assert (found["score"][2, [0, 2]] < 0).all() and (found["barycentric"][:, [0, 2]] < 0).all()
 

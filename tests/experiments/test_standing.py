@@ -25,7 +25,7 @@ def moments(speed, reward, fell, timed_out=None):
     return standing.Moments(nothing, nothing, full(speed), reward, jnp.full_like(reward, reward.mean()), batch)
 
 
-def test_behaviours_in_closed_form():
+def test_behaviors_in_closed_form():
     """Half of the environments stand for ever at reward 1, half walk at 1.4 and fall every 100 steps.
 
     Of 100 walking moments 50 have a fall within the next 50 steps: a hazard of 1 - 0.5^(1/50) a step, and a return of
@@ -33,7 +33,7 @@ def test_behaviours_in_closed_form():
     """
     walking = np.arange(COUNT) % 2 == 1
     fell = walking & ((np.arange(STEPS)[:, None] + 1) % 100 == 0)
-    row = standing.behaviours(moments(np.where(walking, 0.6, 0.05), np.where(walking, 1.4, 1.0), fell))
+    row = standing.behaviors(moments(np.where(walking, 0.6, 0.05), np.where(walking, 1.4, 1.0), fell))
     assert (row["standing_share"], row["walking_share"]) == (0.5, 0.5)
     assert row["standing_reward"] == pytest.approx(1.0)
     assert row["walking_reward"] == pytest.approx(1.4)
@@ -49,10 +49,10 @@ def test_moments_cut_short_by_a_time_out_do_not_count():
     """Episodes of 30 steps that never fall say nothing of the next 50, one that falls after ten says that it falls."""
     steps = np.arange(STEPS)[:, None]
     cut = np.broadcast_to((steps + 1) % 30 == 0, (STEPS, COUNT))
-    row = standing.behaviours(moments(0.0, 1.0, np.zeros((STEPS, COUNT), bool), cut))
+    row = standing.behaviors(moments(0.0, 1.0, np.zeros((STEPS, COUNT), bool), cut))
     assert np.isnan(row["standing_falls_in_1s"])
     fell = np.broadcast_to((steps + 1) % 30 == 10, (STEPS, COUNT))
-    row = standing.behaviours(moments(0.0, 1.0, fell, cut))
+    row = standing.behaviors(moments(0.0, 1.0, fell, cut))
     assert row["standing_falls_in_1s"] == 1.0
 
 
@@ -82,7 +82,7 @@ def test_a_look_at_a_run(tmp_path):
     assert -1 <= figures["gradient_agreement"] <= 1
     assert 0 <= figures["return_survival_share"] <= 1
     assert figures["128_updates_gradient_cosine"] > figures["online_gradient_cosine"]
-    row = standing.behaviours(seen)
+    row = standing.behaviors(seen)
     assert row["standing_share"] + row["walking_share"] <= 1.0
     tracking = standing.track(trainer)
     assert 0.01 < tracking["joint_error"] < tracking["worst_joint_error"] < 1.0

@@ -450,6 +450,16 @@ def test_command_steps_aside_and_says_what_it_chose(robot, tmp_path, capsys):
     assert "chosen: cadence 1." in capsys.readouterr().out
 
 
+def test_a_cadence_that_does_not_follow_the_speed_is_said(robot, tmp_path, capsys):
+    out = tmp_path / "slow.npz"
+    own = robot.gait["cadence"]
+    synthesize(out, "--speed 0.2 --step-height 0.05 --duration 3")
+    assert f": its cadence is {own:g} steps/s, where 1." in capsys.readouterr().out
+    for rest in (f"--speed {robot.gait['speed']} --step-height 0.05", "--speed 0.2 --style.cadence 1.3"):
+        synthesize(out, f"{rest} --duration 3")
+        assert "fits the speed" not in capsys.readouterr().out
+
+
 def test_command_says_what_is_wrong(tmp_path, capsys):
     out = tmp_path / "turn.npz"
     with pytest.raises(SystemExit) as caught:

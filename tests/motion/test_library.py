@@ -79,6 +79,13 @@ def test_bad_lists_are_refused_in_a_sentence(names, sentence):
         load_library(names)
 
 
+def test_a_long_list_is_shown_by_its_first_names():
+    assert library.briefly("walk,turn_left:0.5") == "motion walk,turn_left:0.5"
+    many = library.listed("gaits")
+    said = library.briefly(many)
+    assert said.startswith(f"{len(many.split(','))} motions: gaits/") and said.endswith(" more") and len(said) < 120
+
+
 def test_frames_of_each_motion():
     both = load_library("walk,turn_left", frames="0:49,10:69")
     assert both.lengths.tolist() == [50, 60]

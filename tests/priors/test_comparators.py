@@ -211,7 +211,7 @@ def test_amp_loss_by_hand():
     assert (float(stats["agent_accuracy"]), float(stats["expert_accuracy"])) == (0.0, 0.0)
 
 
-def test_amp_normaliser_weighs_agent_and_demonstration_alike():
+def test_amp_normalizer_weighs_agent_and_demonstration_alike():
     """Against numpy on all that was seen, where the two sides had equally many windows."""
     rng = np.random.default_rng(0)
     state = adversary.Normalizer(jnp.float32(0.0), jnp.zeros(2), jnp.ones(2))
@@ -250,7 +250,7 @@ def test_amp_replay_fills_and_then_turns_over_slowly():
 
 
 def test_amp_scores_before_it_fits(cloud):
-    """The reward of a rollout is that of the discriminator and the normaliser which stood before it."""
+    """The reward of a rollout is that of the discriminator and the normalizer which stood before it."""
     expert, points = cloud
     prior = amp.make(expert, SMALL)
     state = prior.init(jax.random.PRNGKey(0))
@@ -263,7 +263,7 @@ def test_amp_scores_before_it_fits(cloud):
         state = new
 
 
-def test_amp_fits_with_the_normaliser_that_scored():
+def test_amp_fits_with_the_normalizer_that_scored():
     """One window everywhere on either side: whatever is drawn, the first update's loss is that of the initial state."""
     expert = expert_of(np.full((32, 3), 0.7))
     points = np.full((STEPS * COUNT, 3), -0.4)
@@ -313,6 +313,6 @@ def test_amp_slopes_are_those_of_the_full_window():
     prior = amp.make(expert, dataclasses.replace(SMALL, amp=dataclasses.replace(SMALL.amp, hidden=())))
     state = prior.init(jax.random.PRNGKey(0))
     kernel = np.asarray(state.params["params"]["logit"]["kernel"])[:, 0]
-    # The initial normaliser leaves standardised coordinates as they are.
+    # The initial normalizer leaves standardized coordinates as they are.
     logit = np.asarray(prior.score(state, expert.windows))
     np.testing.assert_allclose(logit, np.asarray(windows) * [2.0**0.5, 1.0] @ kernel, atol=1e-5)

@@ -94,8 +94,8 @@ def test_probe_two_clusters_against_transport():
     """The learned score is the transport score of large banks, where that bends: an expert of two clusters."""
     rng = np.random.default_rng(2)
     points = rng.normal(size=(STEPS * COUNT, 2)) * [0.6, 0.3]
-    centre = np.array([[1.0, 0.5], [-1.0, 0.5]])
-    expert = centre[np.arange(64) % 2] + 0.1 * rng.normal(size=(64, 2))
+    center = np.array([[1.0, 0.5], [-1.0, 0.5]])
+    expert = center[np.arange(64) % 2] + 0.1 * rng.normal(size=(64, 2))
     state, _, metrics = learn(expert, points)
 
     @jax.jit
@@ -110,7 +110,7 @@ def test_probe_two_clusters_against_transport():
     # Size as well as direction: the score is not just any function that rises with the true one.
     assert np.std(values) == pytest.approx(np.std(true), rel=0.1)
     assert ((gradient - slope) ** 2).sum(-1).mean() < 0.1 * (slope**2).sum(-1).mean()
-    for target in centre:
+    for target in center:
         path, _ = score_of(state, np.linspace(0, 1, 9)[:, None] * target)
         assert (np.diff(path) > 0).all()
 
@@ -202,7 +202,7 @@ def random_params(seed, size=3, hidden=(8,)):
 
 
 def test_losses_formula(banks, taught):
-    """Value: centred error over c0 squared. Endpoint and flow: mean squared distance of gradients."""
+    """Value: centered error over c0 squared. Endpoint and flow: mean squared distance of gradients."""
     params, query, teacher = random_params(0), banks["query"], taught[2]
     sample = flow.sample_flow(jax.random.PRNGKey(1), query, teacher, banks["source"], banks["expert"])
     weighted = dataclasses.replace(TINY, value_weight=2.0, endpoint_weight=3.0, flow_weight=5.0, value_scale=0.2)
@@ -316,7 +316,7 @@ def test_average_that_goes_on(monkeypatch):
         np.testing.assert_allclose(average, 0.5, atol=1e-5)
 
 
-def test_optimiser_state_persists_between_rollouts(tiny):
+def test_optimizer_state_persists_between_rollouts(tiny):
     _, update, state, points = tiny
     count = lambda s: int(optax.tree_utils.tree_get(s.optimizer, "count"))  # noqa: E731
     assert count(state) == 16
@@ -349,7 +349,7 @@ def test_windows_that_are_not_finite_are_neither_rewarded_nor_learned_from(tiny)
 
 
 def test_an_update_that_is_not_finite_is_skipped_and_counted(tiny):
-    """Non-finite windows that nobody marked: parameters and optimiser stay as they were, and the count tells."""
+    """Non-finite windows that nobody marked: parameters and optimizer stay as they were, and the count tells."""
     _, update, state, points = tiny
     spoiled = np.full_like(points, np.nan)
     new, reward, metrics = update(state, rollout_of(spoiled), jax.random.PRNGKey(1))

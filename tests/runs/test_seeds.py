@@ -42,12 +42,12 @@ def test_seeds_at_once_are_the_seeds_alone(group, tmp_path):
     """To rounding: batched products are summed in another order, which contacts make larger within the chunk."""
     alone = runs.Run.create(tmp_path / "alone", tiny(seed=4))
     runs.train(alone, minutes=1e-6)
-    one, other, neighbour = rows(alone.folder)[0], rows(group / "seed4")[0], rows(group / "seed3")[0]
+    one, other, neighbor = rows(alone.folder)[0], rows(group / "seed4")[0], rows(group / "seed3")[0]
     close = [k for k in one if k.startswith(("train/", "fit/", "ppo/")) and one[k]]
     assert len(close) > 20
     for name in close:
         assert float(other[name]) == pytest.approx(float(one[name]), rel=2e-2, abs=2e-3), name
-    assert abs(float(one["fit/epsilon"]) / float(neighbour["fit/epsilon"]) - 1) > 1e-4
+    assert abs(float(one["fit/epsilon"]) / float(neighbor["fit/epsilon"]) - 1) > 1e-4
     trainer = alone.trainer()
     states = [Checkpoints(f).restore(trainer.init()) for f in (alone.folder, group / "seed4", group / "seed3")]
     np.testing.assert_array_equal(states[0].prior.bank, states[1].prior.bank)

@@ -48,9 +48,9 @@ def test_frames_show_a_moving_robot(robot, walk, using):
 def test_ghost_and_labels_change_the_picture(robot, walk, using):
     plain = render.render_frames(robot, walk, using=using, **SIZE)
     ghost = render.render_frames(robot, walk, ghost=walk + np.eye(walk.shape[1])[0] * 0.4, using=using, **SIZE)
-    labelled = render.render_frames(robot, walk, labels=["", "two", ""], using=using, **SIZE)
+    labeled = render.render_frames(robot, walk, labels=["", "two", ""], using=using, **SIZE)
     assert (plain != ghost).any(axis=(1, 2, 3)).all()
-    assert (plain != labelled).any(axis=(1, 2, 3)).tolist() == [False, True, False]
+    assert (plain != labeled).any(axis=(1, 2, 3)).tolist() == [False, True, False]
 
 
 def test_still_camera_sees_the_robot_cross_the_picture(robot, walk):

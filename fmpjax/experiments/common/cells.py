@@ -1,7 +1,7 @@
 """Cells of an experiment: training runs that differ in what a specification names, each a run folder of its own.
 
 Cells run as processes, several at once where asked, each on its share of the cores: two small runs on a core each are
-faster than one after the other on both. A cell that was killed goes on from its checkpoint, a finished one is left
+faster than one after the other on both. A cell that was killed continues from its checkpoint, a finished one is left
 alone, and one of another configuration is refused.
 """
 
@@ -86,7 +86,8 @@ def read_specification(path: Path) -> Specification:
         if key not in known:
             raise UserError(f"{path}: unknown key {key!r}, expected one of {', '.join(known)}")
         _check(path, key, value)
-    return Specification(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    checked: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    return Specification(**checked)
 
 
 def _check(path: Path, key: str, value: Any) -> None:
@@ -186,7 +187,7 @@ def run(cells: Sequence[Cell], folder: Path, workers: int = 1, *, together: bool
                     progress.note(f"{running[index].name} begins, log in {running[index].log(folder)}")
             time.sleep(_POLL)
             for index, job in list(running.items()):
-                if job.process.poll() is None:
+                if job.process is None or job.process.poll() is None:
                     continue
                 del running[index]
                 good = job.process.returncode == 0 and all(finished(cell, folder) for cell in job.cells)
@@ -232,7 +233,7 @@ class _Job:
         return folder / f"{self.cells[0].name}.log"
 
     def start(self, folder: Path, cores: set[int]) -> None:
-        """Begin, or go on where an earlier process was killed."""
+        """Begin, or continue where an earlier process was killed."""
         first = self.cells[0]
         begun = all((folder / cell.name / "config.json").exists() for cell in self.cells)
         if not begun:

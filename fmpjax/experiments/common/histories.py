@@ -75,7 +75,7 @@ class Cohort(NamedTuple):
 def soon_after_reset(
     trainer: Trainer, policy: PPOState, feature_map: FeatureMap, key: jax.Array, count: int, name: str
 ) -> Cohort:
-    """Up to ``count`` histories 0.34 to 0.64 s after a reset, one an environment, all of their frames executed.
+    """Up to ``count`` histories 0.34 to 0.64 s after a reset, one per environment, all of their frames executed.
 
     Twice as many environments are played with sampled actions, each for a random time; those that have fallen by then
     are left out.

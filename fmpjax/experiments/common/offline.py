@@ -20,14 +20,14 @@ from fmpjax import potential, priors
 from fmpjax.config import Config, PriorConfig
 from fmpjax.errors import UserError
 from fmpjax.experiments.common import histories
-from fmpjax.experiments.common.reference import Reference, centred_error, correlation, cosine, reference, spread
+from fmpjax.experiments.common.reference import Reference, centered_error, correlation, cosine, reference, spread
 from fmpjax.logs import Progress, clock
 from fmpjax.priors import flow
 from fmpjax.shell import default
 from fmpjax.trainer import Trainer
 
 FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the way from a rollout's window to an expert's [P]
-BLOCK = 128  # updates of one call, as many as the paper's of a rollout: the parameter average starts anew in each [P]
+BLOCK = 128  # updates of one call, as many as the paper's of a rollout: the parameter average restarts in each [P]
 GROUPS = "groups"  # the second reference group, measured like a prior
 
 QUERY_SHARE = 0.75  # environments that supply queries; the others are held out [P]
@@ -175,7 +175,7 @@ def lay_out(held_out: int, paths: int, standing: int, walking: int) -> Layout:
 def agreement(candidate: Reference, truth: Reference, layout: Layout, floor: float) -> dict[str, Any]:
     """How a candidate's score and gradient agree with a reference's at the study's queries.
 
-    Rewards are normalised by the median and range of their own scores over the queries compared. Increments are the
+    Rewards are normalized by the median and range of their own scores over the queries compared. Increments are the
     score's change from a path's source, their error is in interquartile ranges of the reference at the sources.
     """
     source = layout.paths[0]
@@ -204,7 +204,7 @@ def agreement(candidate: Reference, truth: Reference, layout: Layout, floor: flo
         "path_increment": [increment_error(rows) for rows in layout.paths],
         "walking_correlation": over(correlation, layout.walking),
         "walking_cosine": over(cosine, layout.walking, field="gradient"),
-        "executed_error": over(centred_error, executed) / jnp.maximum(spread(truth.score[executed]), floor),
+        "executed_error": over(centered_error, executed) / jnp.maximum(spread(truth.score[executed]), floor),
     }
     return jax.tree.map(float, figures)
 
@@ -230,7 +230,7 @@ class _Played(NamedTuple):
     told: dict[str, Any]  # how far the policies were trained, their speeds and the cohorts' sizes
 
 
-def _play(run: Path, walking: Path, size: Size, keys: Sequence[jax.Array]) -> tuple[Trainer, _Played]:
+def _play(run: Path, walking: Path, size: Size, keys: jax.Array) -> tuple[Trainer, _Played]:
     """The standing run's parts, and the windows that both policies execute."""
     trainer, state = histories.policy(run, best=False)
     walker, walker_state = histories.policy(walking, best=True)
@@ -249,7 +249,7 @@ def _play(run: Path, walking: Path, size: Size, keys: Sequence[jax.Array]) -> tu
 
 
 def _measure(
-    trainer: Trainer, played: _Played, fits: Mapping[str, Fit], size: Size, keys: Sequence[jax.Array]
+    trainer: Trainer, played: _Played, fits: Mapping[str, Fit], size: Size, keys: jax.Array
 ) -> tuple[dict[str, dict[str, Any]], float]:
     """Figures of every fit and of the second reference group, by name; and the time of both references, s."""
     config, dimension = trainer.config.prior, trainer.feature_map.dimension

@@ -1,6 +1,6 @@
 """The transport score averaged over independent source banks (eq. mean of the paper), and what agrees with it.
 
-Scores mean something up to a constant alone: they are compared centred.
+Scores mean something up to a constant alone: they are compared centered.
 """
 
 from typing import NamedTuple
@@ -71,6 +71,6 @@ def cosine(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.mean(jnp.sum(a * b, axis=-1) / jnp.maximum(norms, 1e-12))
 
 
-def centred_error(a: jax.Array, b: jax.Array) -> jax.Array:
+def centered_error(a: jax.Array, b: jax.Array) -> jax.Array:
     """Root-mean-square difference of scores ``[q]``, either less its mean."""
     return jnp.std(a - b)

@@ -197,7 +197,7 @@ def latex(final: Sequence[Row]) -> str:
 
 
 def curves(rows: Sequence[Row], paths: Sequence[Path]) -> None:
-    """Late speed, excursion and falls over the budget: a row of panels for each reset, a colour for each method.
+    """Late speed, excursion and falls over the budget: a row of panels for each reset, a color for each method.
 
     Thick lines are means over seeds, thin ones single seeds.
     """

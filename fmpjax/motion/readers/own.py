@@ -35,5 +35,5 @@ def read(file: Path, content: Mapping, robot: Robot, options: Options) -> Record
         rate=positive(file, "rate", content["rate"]),
         rate_from="the file",
         name="qpos row",
-        robot_from="the file" if stored == robot.name else f"--robot; the file's, {stored}, has the same joints",
+        robot_from="the file" if stored == robot.name else f"as asked; the file's, {stored}, has the same joints",
     )

@@ -66,7 +66,7 @@ def convert(
         said.append("frame 0 is another pose, and is left out")
     done = retarget(source, robot, file.stem, span=(first, last), skeleton=names, up=up)
     save(done.clip, out)
-    facts = [*done.clip.reading.facts, Fact("frames", f"{first} to {last}", "--frames" if frames else "all")]
+    facts = [*done.clip.reading.facts, Fact("frames", f"{first} to {last}", "as asked" if frames else "all")]
     verdict, faults = done.verdict(robot)
     lines = [
         f"{file} was read as",

@@ -97,7 +97,7 @@ def retarget(
     qpos, residual = solve(robot, targets, rate)
     thinned = f", one frame of {every}" if every > 1 else ""
     facts = (
-        Fact("robot", robot.name, "--robot"),
+        Fact("robot", robot.name, "as asked"),
         _skeleton_fact(source, joint, told=bool(skeleton)),
         Fact("up", axis, "--up" if up else "hips are over ankles along it"),
         Fact("size", f"{scale:.4g} m per unit", "legs as long as the robot's"),

@@ -169,7 +169,7 @@ def test_frames_may_leave_out_an_end(tmp_path, qpos, frames):
     clip = motion.load(text(tmp_path / "a.csv", qpos), fps=RATE, frames=frames)
     first, last = (20 if "20" in frames else 0), (39 if "39" in frames else 59)
     same(clip, qpos[first : last + 1])
-    assert fact(clip, "rows") == (f"{first} to {last} of 60", "--frames")
+    assert fact(clip, "rows") == (f"{first} to {last} of 60", "as asked")
     with pytest.raises(UserError, match="frames 70:70 are outside"):
         motion.load(tmp_path / "a.csv", frames="70:")
 
