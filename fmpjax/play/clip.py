@@ -47,7 +47,7 @@ class ClipPage:
         self._controls(server.gui)
         with server.gui.add_folder("Check"):
             server.gui.add_markdown(verdicts(check.check(robot, clip, flips)))
-        with server.gui.add_folder("Curves"):
+        with serving.beside(server, "Curves"):
             self._curves(server.gui)
         self._drawn = -1.0
 

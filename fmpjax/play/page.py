@@ -37,7 +37,7 @@ class Page:
         self.view = View(self.server, self.session)
         self.panel = Panel(self.server, self.session, sources, self.loader, self.view)
         scored = any(source.has_prior for source in sources)
-        with self.server.gui.add_folder("Curves"):
+        with serving.beside(self.server, "Curves"):
             self.plots = Plots(self.server.gui, self.session, scored=scored)
         self._scorer = Scorer(self.session, sources, self.plots.add_score) if scored else None
         self._stop = threading.Event()

@@ -12,16 +12,15 @@ from fmpjax.play.view import View
 
 AXES = ("ahead, m/s", "to the left, m/s", "turning left, rad/s")
 LEAST_SPAN = 0.1  # m/s, rad/s of a command that is worth a slider; less is the noise of the demonstrations
+MEAN = 50  # steps over which the speed in the status is a mean, about a stride
 STEP = 0.1  # of a key, m/s and rad/s
 DIRECTIONS = {"forward": (1, 0), "backward": (-1, 0), "left": (0, 1), "right": (0, -1)}
 IMPULSE, MOST_IMPULSE = 15.0, 60.0  # N s
 # Axis and sign of the command that a key changes.
 KEYS = {"W": (0, 1), "S": (0, -1), "A": (2, 1), "D": (2, -1), "Q": (1, 1), "E": (1, -1)}
 ARROWS = {"arrowup": "forward", "arrowdown": "backward", "arrowleft": "left", "arrowright": "right"}
-HELP = (
-    "**W S** speed, **A D** turn, **Q E** sideways, **X** stand, **arrows** push, **P** pause, **R** reset. "
-    "Drag the robot with the mouse."
-)
+KEY_HELP = {0: "**W S** speed", 2: "**A D** turn", 1: "**Q E** sideways"}
+HELP = "**arrows** push, **P** pause, **R** reset. Drag the robot with the mouse."
 
 
 class Panel:
@@ -46,7 +45,8 @@ class Panel:
             self._policies = [self._policy(i, source) for i, source in enumerate(sources)]
         with gui.add_folder("View"):
             self._looks()
-        gui.add_markdown(HELP)
+        told = [KEY_HELP[axis] for axis in KEY_HELP if axis in self._sliders]
+        gui.add_markdown(", ".join([*told, *(["**X** stand"] if told else []), HELP]))
         self._keys()
 
     def update(self) -> None:
@@ -55,7 +55,8 @@ class Panel:
         for player, name, said in zip(session.players, self._loader.names, self._loader.said, strict=True):
             falls = f"{player.falls} fall{'' if player.falls == 1 else 's'}"
             lying = ", lies" if player.lies else ""
-            parts.append(f"**{player.label}** {name}, {falls}{lying}" + (f": {said}" if said else ""))
+            ahead = np.mean([row.velocity[0] for row in list(player.rows)[-MEAN:]]) if player.rows else 0.0
+            parts.append(f"**{player.label}** {name}, {ahead:.2f} m/s, {falls}{lying}" + (f": {said}" if said else ""))
         worst = f", by {1e3 * session.worst:.0f} ms at most" if session.late else ""
         clock = f"{session.time:.1f} s · {1 / session.dt:.0f} Hz, {session.late} of {session.steps} steps late{worst}"
         self._set(self._status, "content", "  \n".join([*parts, clock]))

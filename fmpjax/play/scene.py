@@ -132,7 +132,7 @@ class Floor:
 
 
 def _pieces(model: mujoco.MjModel, geom: int) -> list[Piece]:
-    kind, size, center = model.geom_type[geom], model.geom_size[geom], np.zeros(3)
+    kind, size, center = _GEOM(model.geom_type[geom]), model.geom_size[geom], np.zeros(3)
     if model.geom_group[geom] >= HIDDEN_GROUP or model.geom_rgba[geom, 3] == 0:
         return []
     if kind == _GEOM.mjGEOM_SPHERE:

@@ -3,12 +3,14 @@
 import contextlib
 import io
 import socket
+from collections.abc import Iterator
 
 import viser
 
 from fmpjax.errors import UserError
 
 HOST, PORT = "127.0.0.1", 8080
+WIDTH = 300  # px, of the panel on the left
 
 
 class Server(viser.ViserServer):
@@ -22,6 +24,16 @@ class Server(viser.ViserServer):
         """Close the page."""
         with contextlib.redirect_stdout(io.StringIO()):  # viser says so by itself
             super().stop()
+
+
+@contextlib.contextmanager
+def beside(server: viser.ViserServer, title: str) -> Iterator[None]:
+    """A panel of its own on the left of a page, for what is added to the page within."""
+    panel = server.gui.add_panel()
+    with panel.add_tab(title):
+        yield
+    panel.dock_left()
+    panel.set_width(WIDTH)
 
 
 def start(title: str, host: str = HOST, port: int = PORT) -> Server:

@@ -11,7 +11,7 @@ from fmpjax.play.scene import Figure, Floor
 from fmpjax.play.session import Session
 
 LANE = 1.5  # m between robots in the page; each is alone in its own world
-CAMERA, LOOK_AT = (2.4, -2.6, 1.4), (0.0, 0.0, 0.65)
+CAMERA, LOOK_AT = (1.9, -2.1, 1.2), (0.0, 0.0, 0.65)
 FOLLOWING = 0.3  # s by which the page's middle follows the robot, so that its sway is seen
 FAR = 2.0  # m at which the middle jumps
 
