@@ -280,7 +280,7 @@ def test_the_demonstration_that_moves_like_the_command_goes_along(robot):
 # --- where policies come from ----------------------------------------------------------------------------------------
 
 
-def saved(path, robot, bias=0.0, **changes):
+def saved(path, robot, bias=0.0, moves=None):
     """A file of a policy whose joints stand ``bias`` rad off the default pose."""
     terms = {"root_height": 1, "velocity_commands": 3}
     center = robot.default_qpos[7:].astype(np.float32)
@@ -288,7 +288,7 @@ def saved(path, robot, bias=0.0, **changes):
         robot.joint_names, "none", 50.0, "relu", (np.zeros((4, 29)),), (np.full(29, bias),), np.zeros(4), np.ones(4),
         5.0, center, np.ones(29, np.float32), center - 1, center + 1,
     )  # fmt: skip
-    return policy.save(path, held, said(robot, terms) | changes)
+    return policy.save(path, held, said(robot, terms) | {"robot": moves or robot.name})
 
 
 @pytest.fixture
@@ -368,7 +368,7 @@ def test_the_file_of_a_policy_stands_on_its_robot_or_another_model(robot, tmp_pa
     other = play.source(tmp_path / "policy.npz", model=robots.load("strider").path)
     with pytest.raises(UserError, match="robot.xml has no hinge .*: the policy moves unitree_g1"):
         other.player(other.load("policy.npz"))
-    strange = play.source(saved(tmp_path / "b.npz", robot, robot="strider"))
+    strange = play.source(saved(tmp_path / "b.npz", robot, moves="strider"))
     with pytest.raises(UserError, match="moves other joints than strider has: name its model with --model"):
         strange.player(strange.load("b.npz"))
     policy.save(tmp_path / "c.npz", policy.load(tmp_path / "b.npz"))
@@ -377,9 +377,12 @@ def test_the_file_of_a_policy_stands_on_its_robot_or_another_model(robot, tmp_pa
 
 
 def test_no_pickle_is_loaded(robot, tmp_path):
-    np.savez(tmp_path / "evil.npz", metadata=np.array({"a": 1}, dtype=object))
-    with pytest.raises(UserError, match="evil.npz is not a policy .*allow_pickle=False"):
-        play.source(tmp_path / "evil.npz").load("evil.npz")
+    with np.load(saved(tmp_path / "policy.npz", robot)) as file:
+        arrays = dict(file)
+    for name in ("metadata", "observation"):
+        np.savez(tmp_path / "evil.npz", **arrays | {name: np.array({"a": 1}, dtype=object)})
+        with pytest.raises(UserError, match="evil.npz is not a policy .*allow_pickle=False"):
+            play.source(tmp_path / "evil.npz").load("evil.npz")
 
 
 # --- the page --------------------------------------------------------------------------------------------------------
