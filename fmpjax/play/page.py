@@ -4,7 +4,7 @@ import contextlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 
 from fmpjax.play import server as serving
 from fmpjax.play.loader import Loader, Scorer
@@ -79,7 +79,7 @@ def address(server: serving.Server) -> str:
 
 
 @contextlib.contextmanager
-def quick_turns() -> Iterator[None]:
+def quick_turns() -> Generator[None]:
     """Threads take turns more often: the server of the page must not keep the simulation waiting."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(5e-4)

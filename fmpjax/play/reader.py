@@ -49,6 +49,7 @@ class Reader:
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
         with self._lock:
             process = self._started()
+            assert process.stdin and process.stdout  # they are pipes
             try:
                 process.stdin.write(json.dumps(request) + "\n")
                 process.stdin.flush()

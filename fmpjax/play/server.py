@@ -3,7 +3,7 @@
 import contextlib
 import io
 import socket
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import viser
 
@@ -27,7 +27,7 @@ class Server(viser.ViserServer):
 
 
 @contextlib.contextmanager
-def beside(server: viser.ViserServer, title: str) -> Iterator[None]:
+def beside(server: viser.ViserServer, title: str) -> Generator[None]:
     """A panel of its own on the left of a page, for what is added to the page within."""
     panel = server.gui.add_panel()
     with panel.add_tab(title):

@@ -141,7 +141,7 @@ def _places(text: str, *wanted: str) -> list[dict[str, Any]]:
     ]
 
 
-def _check_plain(said: dict[str, str]) -> None:
+def _check_plain(said: Mapping[str, str]) -> None:
     """Refuse what mjlab's keys may ask for and a policy of fmpjax never does: scales, clips and histories.
 
     Raises:
