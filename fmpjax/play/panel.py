@@ -20,6 +20,12 @@ IMPULSE, MOST_IMPULSE = 15.0, 60.0  # N s
 KEYS = {"W": (0, 1), "S": (0, -1), "A": (2, 1), "D": (2, -1), "Q": (1, 1), "E": (1, -1)}
 ARROWS = {"arrowup": "forward", "arrowdown": "backward", "arrowleft": "left", "arrowright": "right"}
 KEY_HELP = {0: "**W S** speed", 2: "**A D** turn", 1: "**Q E** sideways"}
+# viser moves the camera by these keys, too: its listener is at the document, that of the hotkeys at the element below.
+# A script runs in a page of viser where an image fails to load.
+_KEEP_CAMERA = """<img src="data:," style="display: none" onerror="
+window.fmpjaxKeys ||= document.documentElement.addEventListener('keydown', event => {
+  if (/^(Key[WASDQE]|Arrow)/.test(event.code)) event.stopPropagation();
+}) || true">"""
 HELP = "**arrows** push, **P** pause, **R** reset. Drag the robot with the mouse."
 
 
@@ -135,6 +141,8 @@ class Panel:
         follow.on_update(lambda _: setattr(view, "watched", chosen.get(follow.value, view.watched)))
 
     def _keys(self) -> None:
+        self._gui.add_html(_KEEP_CAMERA)
+
         def add(label: str, key, act: Callable[[], None]) -> None:
             self._gui.add_command(label, hotkey=key).on_trigger(lambda _: act())
 
