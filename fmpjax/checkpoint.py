@@ -5,6 +5,7 @@ mismatch can be named. Orbax writes to a temporary folder and renames it: a kill
 """
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -63,17 +64,7 @@ class Checkpoints:
         Raises:
           UserError: there is none, it cannot be read, or it is of another configuration.
         """
-        step = self.latest(best=best) if iteration is None else iteration
-        kind = "best" if best else "checkpoints"
-        if step is None:
-            raise UserError(f"run {self.run} has no checkpoint in {kind}/: expected one, train it first")
-        folder = self.run / kind / str(step)
-        try:
-            with self._manager(kind, KEEP) as manager:
-                saved = manager.restore(step, args=ocp.args.StandardRestore())
-        except Exception as error:  # orbax and tensorstore raise many kinds for a damaged folder
-            cause = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
-            raise UserError(f"checkpoint {folder} cannot be read ({cause}): expected a whole checkpoint") from None
+        folder, saved = self._read(iteration, best)
         expected = _flatten(like)
         if set(saved) != set(expected):
             name = sorted(set(saved) ^ set(expected))[0]
@@ -86,3 +77,40 @@ class Checkpoints:
                 )
         leaves = [jnp.asarray(np.asarray(saved[name])) for name in expected]
         return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+    def part(self, name: str, iteration: int | None = None, *, best: bool = False) -> Any:
+        """A part of a checkpoint's state by itself, such as ``ppo.actor``: nested dictionaries of arrays.
+
+        The rest of the state may be of another version of the program.
+
+        Raises:
+          UserError: there is no checkpoint, it cannot be read, or it has no such part.
+        """
+        folder, saved = self._read(iteration, best)
+        found: dict[str, Any] = {}
+        for path, leaf in saved.items():
+            if not path.startswith(name + "."):
+                continue
+            *parents, last = path.removeprefix(name + ".").split(".")
+            inner = found
+            for key in parents:
+                inner = inner.setdefault(key, {})
+            inner[last] = np.asarray(leaf)
+        if not found:
+            raise UserError(f"checkpoint {folder} is of another configuration: it has no {name}")
+        return found
+
+    def _read(self, iteration: int | None, best: bool) -> tuple[Path, dict[str, Any]]:
+        """Folder and leaves of a checkpoint."""
+        step = self.latest(best=best) if iteration is None else iteration
+        kind = "best" if best else "checkpoints"
+        if step is None:
+            raise UserError(f"run {self.run} has no checkpoint in {kind}/: expected one, train it first")
+        folder = self.run / kind / str(step)
+        try:
+            with self._manager(kind, KEEP) as manager:
+                saved = manager.restore(step, args=ocp.args.StandardRestore())
+        except Exception as error:  # orbax and tensorstore raise many kinds for a damaged folder
+            cause = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
+            raise UserError(f"checkpoint {folder} cannot be read ({cause}): expected a whole checkpoint") from None
+        return folder, saved

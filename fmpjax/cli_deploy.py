@@ -29,10 +29,16 @@ class Sim2Sim:
     """What a policy that takes commands is told, as SECONDS:FORWARD,LEFT,TURN in m/s and rad/s, leg after leg."""
     video: Annotated[Path | None, default("no video")] = None
     """Film the first episode: a file .mp4, or .gif where no encoder is installed."""
+    keyboard: bool = False
+    """Steer it by the keys of MuJoCo's viewer, in place of episodes; needs a display."""
+    gamepad: bool = False
+    """The same with a gamepad, too."""
 
     def __call__(self) -> None:
         from fmpjax import robots, sim2sim
 
+        if self.keyboard or self.gamepad:
+            return self._steered()
         if not 0 < self.seconds < math.inf:
             raise UserError(f"--seconds is {self.seconds:g}: expected a number above 0")
         if self.episodes < 1:
@@ -53,3 +59,15 @@ class Sim2Sim:
 
             frames = render.render_frames(robot, played[0].qpos[::2], labels="sim2sim")
             print(f"wrote {render.write_video(self.video, frames, fps=0.5 / policy.step_dt)}")
+
+    def _steered(self) -> None:
+        from fmpjax import play, sim2sim
+
+        option = "--gamepad" if self.gamepad else "--keyboard"
+        if self.course or self.video is not None:
+            raise UserError(f"{option} is steered by hand: expected no --course and no --video")
+        play.check_display(option)
+        simulation = sim2sim.Simulation(sim2sim.load(self.policy), self.model, own_gains=self.gains == "model")
+        for sentence in simulation.differences:
+            print(f"unlike in training: {sentence}")
+        play.drive(simulation, gamepad=self.gamepad)

@@ -165,12 +165,25 @@ class View(Source):
 
     out: Annotated[Path | None, default("the viewer, or NAME.png without a display")] = None
     """A contact sheet (.png) or a video (.mp4, .gif)."""
+    browser: bool = False
+    """Show it in a page of the browser, with its joints, contacts and the verdicts of `motion check`."""
+    host: str = "127.0.0.1"
+    """Address of the page; others than this machine's own let everyone in the network see it."""
+    port: int = 8080
+    """Port of the page; 0 for any that is free."""
 
     def __call__(self) -> None:
         from fmpjax.viz import clip as show
 
+        if self.browser and self.out is not None:
+            raise UserError("--browser and --out do not go together: one shows a page, the other writes a file")
         robot = robots.load(self.robot)
-        clip, _ = self.clip()
+        clip, flips = self.clip()
+        if self.browser:
+            from fmpjax import play
+
+            play.check_installed()
+            return play.clip(robot, clip, flips=flips, host=self.host, port=self.port)
         if self.out is None and show.has_display():
             show.play(robot, clip)
         else:

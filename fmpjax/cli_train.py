@@ -1,5 +1,6 @@
 """The command `fmpjax train`."""
 
+import contextlib
 import dataclasses
 import os
 import time
@@ -83,6 +84,10 @@ class Train:
     """Number of this process, from 0, likewise."""
     resume: bool = False
     """Go on with the run in --run, with its settings."""
+    live: bool = False
+    """Show the policy as it trains in a page of the browser; docs/play.md."""
+    port: int = 8080
+    """Port of that page; 0 for any that is free."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Any other setting as section.field=value; `fmpjax settings` explains all of them."""
 
@@ -93,6 +98,12 @@ class Train:
             raise UserError(f"--seeds is {self.seeds}: expected at least 1")
         if self.devices < 0:
             raise UserError(f"--devices is {self.devices}: expected 0 (for all) or more")
+        if self.live:
+            from fmpjax import play
+
+            if self.distributed:
+                raise UserError("--live does not go with --distributed: `fmpjax play RUN` shows the checkpoints")
+            play.check_installed()
         began = time.monotonic()
         self._connect()
         runs = runs_module()
@@ -103,7 +114,9 @@ class Train:
         else:
             group = self._begun(devices)
         minutes = None if self.minutes is None else self.minutes - (time.monotonic() - began) / 60
-        end = runs.train(*group, resume=self.resume, minutes=minutes, devices=devices)
+        page = runs.Live(group, self.port) if self.live else None
+        with page or contextlib.nullcontext():
+            end = runs.train(*group, resume=self.resume, minutes=minutes, devices=devices, live=page)
         from fmpjax import sharding
 
         # Who sends a signal wants the process to end, not to film.

@@ -1,5 +1,8 @@
 """A trained policy without the training stack: one small file, and NumPy to run it."""
 
+import json
+import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,6 +15,8 @@ if TYPE_CHECKING:
     from fmpjax.ppo import PPOState
     from fmpjax.trainer import Trainer
 
+LIVE = "live.npz"  # in a run's folder, its policy while it trains with --live
+_EXPECTED = "expected policy.npz as `fmpjax export` writes it"
 _ACTIVATIONS = {
     "relu": lambda x: np.maximum(x, 0.0),
     "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0.0))),
@@ -80,13 +85,37 @@ def of(trainer: "Trainer", state: "PPOState") -> Policy:
     )
 
 
-def save(path: Path, policy: Policy) -> Path:
-    """Write a policy as ``.npz``, a layer's arrays each on their own; the path written."""
+def save(path: Path, policy: Policy, metadata: Mapping[str, str] | None = None) -> Path:
+    """Write a policy as ``.npz``, a layer's arrays each on their own, whole or not at all; the path written.
+
+    ``metadata`` is what `fmpjax.deploy.metadata` says of it, by which `fmpjax play` simulates its robot.
+    """
     arrays = policy._asdict()
     for name in ("kernels", "biases"):
         arrays |= {f"{name}.{i}": array for i, array in enumerate(arrays.pop(name))}
-    np.savez(path, **arrays)
+    if metadata is not None:
+        arrays["metadata"] = json.dumps(dict(metadata))
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        np.savez(file, **arrays)
+    os.replace(partial, path)
     return path
+
+
+def metadata(path: str | Path) -> dict[str, str]:
+    """What `save` was told of the policy.
+
+    Raises:
+      UserError: the file is missing or is no policy, or `save` was told nothing.
+    """
+    try:
+        with np.load(path) as file:
+            said = json.loads(file["metadata"].item()) if "metadata" in file else None
+    except (OSError, ValueError, TypeError) as error:
+        raise UserError(f"{path} is not a policy ({error}): {_EXPECTED}") from None
+    if not (isinstance(said, dict) and all(isinstance(text, str) for text in said.values())):
+        raise UserError(f"{path} does not say what its robot is: {_EXPECTED}")
+    return said
 
 
 def load(path: str | Path) -> Policy:
@@ -97,7 +126,7 @@ def load(path: str | Path) -> Policy:
     """
     try:
         with np.load(path) as file:
-            arrays = {name: file[name] for name in file.files}
+            arrays = {name: file[name] for name in file.files if name != "metadata"}
         layers = range(sum(name.startswith("kernels.") for name in arrays))
         for name in ("kernels", "biases"):
             arrays[name] = tuple(arrays.pop(f"{name}.{i}") for i in layers)
@@ -105,4 +134,4 @@ def load(path: str | Path) -> Policy:
         arrays["joint_names"] = tuple(map(str, arrays["joint_names"]))
         return Policy(**arrays)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path} is not a policy ({error}): expected policy.npz as `fmpjax export` writes it") from None
+        raise UserError(f"{path} is not a policy ({error}): {_EXPECTED}") from None

@@ -31,7 +31,7 @@ def test_every_requirement_is_imported_and_pinned():
     optional = project["optional-dependencies"]
     for requirement in [
         *project["dependencies"],
-        *(r for extra in ("viz", "retarget", "deploy") for r in optional[extra]),
+        *(r for extra in ("viz", "retarget", "deploy", "play") for r in optional[extra]),
     ]:
         name = _name(requirement)
         module = IMPORTED_AS.get(name, re.match(r"[A-Za-z0-9-]+", requirement)[0])

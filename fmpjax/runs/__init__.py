@@ -5,10 +5,12 @@ from fmpjax.provenance import machine, provenance
 from fmpjax.runs.clock import End
 from fmpjax.runs.folder import Run, check_trainable, default_folder, default_preset, describe, load_motion
 from fmpjax.runs.outputs import export, finish, video
+from fmpjax.runs.served import Live
 from fmpjax.runs.training import train
 
 __all__ = [
     "End",
+    "Live",
     "Run",
     "check_trainable",
     "default_folder",

@@ -92,15 +92,17 @@ def export(run: Run, out: Path, *, onnx: bool = False) -> list[Path]:
         if trained:
             trainer, state = run.policy()
             learned = policy.of(trainer, state.ppo)
-            copied.append(policy.save(out / "policy.npz", learned))
+            origin = origin_of(run)
+            said = deploy.metadata(learned, trainer.robot, origin)
+            copied.append(policy.save(out / "policy.npz", learned, said))
             if onnx:
-                copied += deploy.write(out, learned, trainer.robot, _origin(run))
+                copied += deploy.write(out, learned, trainer.robot, origin)
         return [*(out / n for n in texts), *copied]
     except OSError as error:
         raise UserError(f"folder {out} cannot be written: {error.strerror}") from None
 
 
-def _origin(run: Run) -> deploy.Origin:
+def origin_of(run: Run) -> deploy.Origin:
     """Where the run's policy comes from, as its ONNX file and its card say."""
     evaluation, robustness = (_figures(run.folder / name) for name in ("evaluation.json", "robustness.json"))
     return deploy.Origin(

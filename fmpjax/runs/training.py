@@ -15,6 +15,7 @@ from fmpjax.provenance import machine
 from fmpjax.runs.clock import Clock, End
 from fmpjax.runs.folder import Run
 from fmpjax.runs.recorder import Recorder
+from fmpjax.runs.served import Live
 from fmpjax.runs.session import Session
 
 try:
@@ -23,21 +24,27 @@ except ImportError:  # on Windows, where every command says that it does not run
     fcntl = None
 
 
-def train(*group: Run, resume: bool = False, minutes: float | None = None, devices: int | None = 1) -> End:
+def train(
+    *group: Run,
+    resume: bool = False,
+    minutes: float | None = None,
+    devices: int | None = 1,
+    live: Live | None = None,
+) -> End:
     """Train a run to the end of its budget, or of its time, or until it is told to stop; all three end cleanly.
 
     Several runs that differ in nothing but their seeds are trained at once, as one program, each into its own folder.
-    Several devices, all of them for None, share the environments or the seeds.
+    Several devices, all of them for None, share the environments or the seeds. ``live`` shows the policies meanwhile.
 
     Raises:
       UserError: the runs do not belong together, too much was not finite, or memory is too small; what was saved stays.
     """
     memory.check(group[0].config, len(group))
     with enough_memory(group), held(group):
-        return _train(*group, resume=resume, minutes=minutes, devices=devices)
+        return _train(*group, resume=resume, minutes=minutes, devices=devices, live=live)
 
 
-def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None) -> End:
+def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None, live: Live | None) -> End:
     progress = Progress(show=sharding.primary())
     config, began = group[0].config, time.monotonic()
     progress.note(
@@ -51,6 +58,8 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
     if session.done and sharding.primary():
         for run in group:
             run.resumed()
+    if live is not None:
+        live.open(session)
     compiling = _compile(session, devices, progress)
     recorders = _recorders(session, progress)
     training = Clock(
@@ -63,7 +72,7 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
         spare=compiling,
         agree=sharding.agree,
     )
-    end = _loop(session, training, recorders, progress)
+    end = _loop(session, training, recorders, progress, live)
     for recorder in recorders:
         recorder.close()
     if end is not End.BUDGET:
@@ -71,7 +80,9 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
     return end
 
 
-def _loop(session: Session, training: Clock, recorders: Sequence[Recorder], progress: Progress) -> End:
+def _loop(
+    session: Session, training: Clock, recorders: Sequence[Recorder], progress: Progress, live: Live | None
+) -> End:
     """Call the program until the budget or the time is spent or a signal comes, and do what is due in between.
 
     Several processes must come to the same calls of the devices and of each other in the same order.
@@ -83,6 +94,8 @@ def _loop(session: Session, training: Clock, recorders: Sequence[Recorder], prog
             training.tick(session.done, took)
             progress.show(progress_line(training, rows), final=training.spent)
             session.check_finite()
+            if live is not None:
+                live.show(session)
             due = training.due(asked=stop.requested)
             # Before the evaluation, after which processes are no longer in step.
             states = session.on_host() if due.save else [None] * len(rows)

@@ -6,7 +6,7 @@ contacts. Its servos get the policy's gains and torque limits, unless it is to k
 """
 
 from fmpjax.sim2sim.episodes import COURSE, Course, Episode, course, play, report
-from fmpjax.sim2sim.exported import Policy, load
+from fmpjax.sim2sim.exported import Policy, load, read
 from fmpjax.sim2sim.simulation import Simulation
 from fmpjax.sim2sim.traits import FACTS, facts, integrator
 
@@ -22,5 +22,6 @@ __all__ = [
     "integrator",
     "load",
     "play",
+    "read",
     "report",
 ]

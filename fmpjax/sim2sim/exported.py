@@ -1,7 +1,7 @@
 """The policy in an ONNX file from `fmpjax export --onnx`."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from fmpjax.sim2sim.traits import FACTS
 
 
 class Policy(NamedTuple):
-    """What an ONNX file from `fmpjax export --onnx` holds; ``J`` joints."""
+    """A policy with what its file says of it; ``J`` joints."""
 
     act: Callable[[np.ndarray], np.ndarray]  # observation [O] -> actions [J]
     terms: dict[str, int]  # names and widths of the observation's parts
@@ -36,6 +36,7 @@ class Policy(NamedTuple):
     integrator: str  # MuJoCo's name of it, in training
     facts: dict[str, np.ndarray]  # what `facts` says of the model of the training
     robot: str
+    commands: np.ndarray | None = None  # [2, 3] lowest and highest velocity that it may be told (m/s, m/s, rad/s)
 
 
 def load(path: str | Path) -> Policy:
@@ -57,12 +58,40 @@ def load(path: str | Path) -> Policy:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has a class for each kind
         raise UserError(f"{path} is not an ONNX file ({str(error).splitlines()[0]}): {expected}") from None
-    said = session.get_modelmeta().custom_metadata_map
+    names = [node.name for node in (*session.get_inputs(), session.get_outputs()[0])]
+    if names != ["obs", "actions"]:
+        raise UserError(f"{path} maps {', '.join(names[:-1])} to {names[-1]}: expected obs to actions")
+    return read(
+        path,
+        session.get_modelmeta().custom_metadata_map,
+        lambda x: session.run(["actions"], {"obs": x[None].astype(np.float32)})[0][0],
+        (session.get_inputs()[0].shape, session.get_outputs()[0].shape),
+    )
+
+
+def read(
+    path: str | Path,
+    said: Mapping[str, str],
+    act: Callable[[np.ndarray], np.ndarray],
+    shapes: tuple[Sequence[int], Sequence[int]],
+) -> Policy:
+    """A policy from the metadata of its file.
+
+    Args:
+      path: the file, for sentences.
+      said: the metadata, text by key.
+      act: observation ``[O]`` -> actions ``[J]``.
+      shapes: of what it takes and gives, ``[1, O]`` and ``[1, J]``.
+
+    Raises:
+      UserError: the metadata lacks something, cannot be read or does not fit the shapes.
+    """
+    expected = "expected a file as `fmpjax export --onnx` writes it"
     try:
         _check_plain(said)
         widths = map(int, said["observation_widths"].split(","))
         policy = Policy(
-            act=lambda x: session.run(["actions"], {"obs": x[None].astype(np.float32)})[0][0],
+            act=act,
             terms=dict(zip(said["observation_names"].split(","), widths, strict=True)),
             history=_history(said),
             joint_names=tuple(said["joint_names"].split(",")),
@@ -83,12 +112,13 @@ def load(path: str | Path) -> Policy:
             integrator=said["integrator"],
             facts={name: _rows(said[name]) for name in FACTS},
             robot=said["robot"],
+            commands=_rows(said["command_ranges"]).T if said.get("command_ranges") else None,
         )
     except KeyError as error:
         raise UserError(f"{path} has no metadata {error}: {expected}") from None
     except (ValueError, TypeError) as error:
         raise UserError(f"{path} has metadata that cannot be read ({error}): {expected}") from None
-    _check(path, policy, session)
+    _check(path, policy, shapes)
     return policy
 
 
@@ -113,7 +143,7 @@ def _places(text: str, *wanted: str) -> list[dict[str, Any]]:
     ]
 
 
-def _check_plain(said: dict[str, str]) -> None:
+def _check_plain(said: Mapping[str, str]) -> None:
     """Refuse what mjlab's keys may ask for and a policy of fmpjax never does: scales and clips.
 
     Raises:
@@ -125,7 +155,7 @@ def _check_plain(said: dict[str, str]) -> None:
             raise ValueError(f"observation_terms_{key} is {min(values - {plain})}, and sim2sim knows {plain} alone")
 
 
-def _history(said: dict[str, str]) -> int:
+def _history(said: Mapping[str, str]) -> int:
     """Steps that each part of the observation is of.
 
     Raises:
@@ -139,15 +169,12 @@ def _history(said: dict[str, str]) -> int:
     return max(1, int(lengths.pop()))
 
 
-def _check(path: str | Path, policy: Policy, session) -> None:
+def _check(path: str | Path, policy: Policy, shapes: tuple[Sequence[int], Sequence[int]]) -> None:
     joints, size = len(policy.joint_names), sum(policy.terms.values())
-    names = [node.name for node in (*session.get_inputs(), session.get_outputs()[0])]
-    if names != ["obs", "actions"]:
-        raise UserError(f"{path} maps {', '.join(names[:-1])} to {names[-1]}: expected obs to actions")
-    taken, given = session.get_inputs()[0].shape, session.get_outputs()[0].shape
     for name in policy.terms:
         if name not in TERMS:
             raise UserError(f"{path} observes {name!r}, which sim2sim does not know: expected {', '.join(TERMS)}")
+    taken, given = map(list, shapes)
     if (taken, given) != ([1, size], [1, joints]):
         raise UserError(f"{path} maps {taken} to {given}: its metadata tells of [1, {size}] to [1, {joints}]")
     per_joint = ("center", "scale", "stiffness", "damping", "effort", "joint_limits", "joint_axes")
@@ -156,3 +183,5 @@ def _check(path: str | Path, policy: Policy, session) -> None:
             raise UserError(f"{path} has {len(rows)} of {name}: expected one per joint, {joints}")
     if len(policy.default_qpos) != 7 + joints:
         raise UserError(f"{path} has {len(policy.default_qpos)} numbers in default_qpos: expected {7 + joints}")
+    if policy.commands is not None and policy.commands.shape != (2, 3):
+        raise UserError(f"{path} has command_ranges of shape {policy.commands.shape[::-1]}: expected (3, 2)")

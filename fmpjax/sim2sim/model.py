@@ -26,6 +26,22 @@ def check_servos(model: mujoco.MjModel, servos: dict[str, int | None], path: str
             raise UserError(f"{path} has no position servo on {name}: expected one per joint where it keeps its gains")
 
 
+def prepared(policy: Policy, path: str | Path, own_gains: bool) -> tuple[mujoco.MjModel, list[str]]:
+    """The model in a file with the policy's servos and a floor, and sentences on what was added.
+
+    Raises:
+      UserError: the file cannot be read, or is no model of the policy's robot.
+    """
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        said = prepare(spec, policy, path, own_gains)
+        return spec.compile(), said
+    except UserError:
+        raise
+    except (ValueError, FileNotFoundError) as error:
+        raise UserError(f"{path} cannot be read as MJCF: {' '.join(str(error).split())}") from None
+
+
 def prepare(spec: mujoco.MjSpec, policy: Policy, path: str | Path, own_gains: bool) -> list[str]:
     """Give the policy's joints its servos unless ``own_gains``, and the world a floor; sentences on what was added.
 

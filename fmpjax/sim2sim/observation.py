@@ -19,7 +19,7 @@ def _joint_rotations(sim) -> np.ndarray:
 
 def _heading(sim, vectors: np.ndarray) -> np.ndarray:
     """World vectors ``[..., 3]`` in axes of which x points where the root faces."""
-    x, y = sim.axes[:2, 0] / max(np.linalg.norm(sim.axes[:2, 0]), 1e-6)
+    x, y = sim.facing
     return vectors @ np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
 
 

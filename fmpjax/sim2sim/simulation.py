@@ -9,7 +9,7 @@ import numpy as np
 from fmpjax.errors import UserError
 from fmpjax.sim2sim.differences import differences
 from fmpjax.sim2sim.exported import Policy
-from fmpjax.sim2sim.model import check_servos, drives_joint, prepare
+from fmpjax.sim2sim.model import check_servos, drives_joint, prepared
 from fmpjax.sim2sim.observation import TERMS
 
 _DEEPEST = 1.5e-3  # m, penetration of the floor at the start; the policy's own robot stands 1 mm in it
@@ -21,26 +21,29 @@ class Simulation:
     ``differences`` is a list of sentences: what is not as it was in training. ``time`` is s since the last reset.
     """
 
-    def __init__(self, policy: Policy, path: str | Path, *, own_gains: bool = False):
+    def __init__(
+        self,
+        policy: Policy,
+        path: str | Path,
+        *,
+        own_gains: bool = False,
+        model: mujoco.MjModel | None = None,
+    ):
         """Read an MJCF file.
 
         Args:
           policy: what is to run on it.
           path: the file.
           own_gains: keep the file's position servos; otherwise they get the policy's gains and torque limits.
+          model: with servos and floor, where the file has been read already; it is taken as it is.
 
         Raises:
           UserError: it cannot be read, or is no model of the policy's robot, or has no servos to keep.
         """
-        self.policy = policy
-        try:
-            spec = mujoco.MjSpec.from_file(str(path))
-            said = prepare(spec, policy, path, own_gains)
-            self.model = model = spec.compile()
-        except UserError:
-            raise
-        except (ValueError, FileNotFoundError) as error:
-            raise UserError(f"{path} cannot be read as MJCF: {' '.join(str(error).split())}") from None
+        self.policy, said = policy, []
+        if model is None:
+            model, said = prepared(policy, path, own_gains)
+        self.model = model
         # A state that blows up is a fall, not a reset in silence.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.data = mujoco.MjData(model)
@@ -98,6 +101,20 @@ class Simulation:
         mujoco.mj_kinematics(self.model, data)
         self.time, self.action, self._past = 0.0, np.zeros(len(self._qpos)), []
 
+    def place(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Start in a state in the policy's order, ``qpos [7 + J]`` and ``qvel [6 + J]``."""
+        data = self.data
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[self._root : self._root + 7], data.qpos[self._qpos] = qpos[:7], qpos[7:]
+        data.qvel[self._root_dof : self._root_dof + 6], data.qvel[self._qvel] = qvel[:6], qvel[6:]
+        mujoco.mj_kinematics(self.model, data)
+        self.time, self.action, self.raised = 0.0, np.zeros(len(self._qpos)), 0.0
+
+    @property
+    def root_body(self) -> int:
+        """Index of the body that carries the others."""
+        return self._root_body
+
     @property
     def qpos(self) -> np.ndarray:
         """Configuration in the policy's order, ``[7 + J]``."""
@@ -112,6 +129,11 @@ class Simulation:
     def axes(self) -> np.ndarray:
         """The root's axes in the world, the columns of ``[3, 3]``."""
         return self.data.xmat[self._root_body].reshape(3, 3)
+
+    @property
+    def facing(self) -> np.ndarray:
+        """Where the root faces over the floor, a unit vector ``[2]``."""
+        return self.axes[:2, 0] / max(np.linalg.norm(self.axes[:2, 0]), 1e-6)
 
     def key_points(self) -> np.ndarray:
         """Key points less the root, in the world's axes, ``[K, 3]`` m."""
@@ -147,6 +169,6 @@ class Simulation:
 
     def velocity(self) -> np.ndarray:
         """Velocity of the root forward and to the left in its own heading (m/s), and its turn (rad/s), ``[3]``."""
-        x, y = self.axes[:2, 0] / max(np.linalg.norm(self.axes[:2, 0]), 1e-6)
+        x, y = self.facing
         forward, left = np.array([[x, y], [-y, x]]) @ self.qvel[:2]
         return np.array([forward, left, (self.axes @ self.qvel[3:6])[2]])

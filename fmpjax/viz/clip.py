@@ -25,20 +25,27 @@ COLOURS = ("#2a6fb0", "#c8553d", "#3a8a6b")  # left, right, neither
 KIND_COLOURS = dict(zip(KINDS, ("#b8b8b8", "#9b6fb0", "#2a6fb0", "#3a8a6b", "#c8553d"), strict=True))
 
 
+_NO_DISPLAY = "there is no display"
+
+
 def has_display() -> bool:
     """Whether a window can be opened here; where one is promised and does not open, a sentence says so."""
+    reason = no_window()
+    if reason not in (None, _NO_DISPLAY):
+        print(f"fmpjax: {reason}: a picture is drawn instead", file=sys.stderr, flush=True)
+    return reason is None
+
+
+def no_window() -> str | None:
+    """Why no window can be opened here; None where one can."""
     if sys.platform == "darwin":
         import mujoco.viewer
 
-        opens, where = mujoco.viewer._MJPYTHON is not None, "on macOS without mjpython"
-    else:
-        named = [f"{name} {os.environ[name]!r}" for name in ("DISPLAY", "WAYLAND_DISPLAY") if os.environ.get(name)]
-        if not named:
-            return False
-        opens, where = _window_opens(), f"on {' and '.join(named)}"
-    if not opens:
-        print(f"fmpjax: no window opens {where}: a picture is drawn instead", file=sys.stderr, flush=True)
-    return opens
+        return None if mujoco.viewer._MJPYTHON is not None else "no window opens on macOS without mjpython"
+    named = [f"{name} {os.environ[name]!r}" for name in ("DISPLAY", "WAYLAND_DISPLAY") if os.environ.get(name)]
+    if not named:
+        return _NO_DISPLAY
+    return None if _window_opens() else f"no window opens on {' and '.join(named)}"
 
 
 def _window_opens() -> bool:

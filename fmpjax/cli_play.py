@@ -1,0 +1,48 @@
+"""The command `fmpjax play`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from fmpjax.errors import UserError
+from fmpjax.shell import default
+
+
+@dataclasses.dataclass(frozen=True)
+class Play:
+    """Play with policies in real time, in a page of the browser: command them, push them, compare checkpoints."""
+
+    what: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders, also of runs that still train, and policies (policy.onnx, policy.npz), side by side."""
+    checkpoint: Annotated[str | None, default("the best")] = None
+    """Policy of the runs to begin with: `best`, `newest`, `live` (of `train --live`) or an iteration."""
+    model: Annotated[Path | None, default("the robot of the training")] = None
+    """MJCF file with the joints of the policies, which then are files."""
+    host: str = "127.0.0.1"
+    """Address to listen at; others than this machine's own let everyone in the network play."""
+    port: int = 8080
+    """Port of the page; 0 for any that is free."""
+    native: bool = False
+    """Open MuJoCo's own viewer in place of a page, for one policy; needs a display."""
+    gamepad: bool = False
+    """Steer by a gamepad, too; with --native."""
+
+    def __call__(self) -> None:
+        from fmpjax import play
+
+        if not self.what:
+            raise UserError("there is nothing to play: expected a run folder or the file of a policy")
+        if self.gamepad and not self.native:
+            raise UserError("--gamepad goes with --native: a page is steered by its keys and sliders")
+        if self.native:
+            if len(self.what) > 1:
+                raise UserError(f"--native shows one robot: expected one run or policy, not {len(self.what)}")
+            play.check_display("--native")
+        play.check_installed(page=not self.native)
+        sources = [play.source(path, name=self.checkpoint, model=self.model) for path in self.what]
+        if self.native:
+            play.native(sources[0], gamepad=self.gamepad)
+        else:
+            play.page(sources, host=self.host, port=self.port)

@@ -1,0 +1,108 @@
+"""A run's policies for a page: what a checkpoint gives, what the prior says, and the files of a run that trains."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fmpjax import policy, sim2sim
+from fmpjax.checkpoint import _flatten
+from fmpjax.errors import UserError
+from fmpjax.play.reader import Reader
+from fmpjax.play.source import read_npz
+from fmpjax.runs import Run, served
+from tests.helpers import tiny
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run with the checkpoint of its start."""
+    made = Run.create(tmp_path_factory.mktemp("runs") / "run", tiny(motion="walk", **{"command.kind": "velocity"}))
+    made.checkpoints.save(made.trainer().init())
+    return made
+
+
+@pytest.fixture
+def states(walk):
+    return {"qpos": walk.qpos[20:30], "qvel": walk.qvel[20:30]}
+
+
+def test_a_checkpoint_gives_a_policy_that_says_what_its_robot_is(run, tmp_path):
+    path = served.Served(run, tmp_path).policy(0, False)
+    wanted, found = policy.of(run.trainer(), run.trainer().init().ppo), policy.load(path)
+    observations = np.random.default_rng(0).normal(size=(5, len(wanted.mean)))
+    np.testing.assert_allclose(found(observations), wanted(observations), atol=1e-6)
+    played = read_npz(path)
+    np.testing.assert_allclose(
+        played.center + played.scale * played.act(observations[0]), wanted(observations[0]), atol=1e-6
+    )
+    assert played.robot == "unitree_g1" and played.commands.shape == (2, 3)
+    assert played.commands[1, 0] == pytest.approx(0.86, abs=0.02)  # m/s, the walk's own
+    sim2sim.Simulation(played, run.trainer().robot.path, model=run.trainer().robot.model)
+
+
+def test_the_prior_prefers_the_demonstration_as_training_does(run, tmp_path, states):
+    asked = served.Served(run, tmp_path)
+    asked.policy(None, False)
+    answer = asked.answer({"score": {name: rows.tolist() for name, rows in states.items()}})
+    trainer = run.trainer()
+    rows = np.arange(20, 30)
+    frames = trainer.env._table.frame[rows]
+    wanted = trainer.prior.score(trainer.init().prior, trainer.prior_map(frames[None]))
+    assert answer["score"] == pytest.approx(float(wanted[0]), abs=1e-4) and np.isfinite(answer["demonstration"])
+
+
+def test_a_checkpoint_of_another_version_is_played_without_its_prior(run, tmp_path, states, monkeypatch):
+    leaves = _flatten(run.trainer().init())
+    older = {name: leaf for name, leaf in leaves.items() if not name.startswith("prior.")}
+    monkeypatch.setattr(run.checkpoints, "_read", lambda iteration, best: (tmp_path, older))
+    asked = served.Served(run, tmp_path)
+    assert policy.load(asked.policy(0, False)).rate == 50.0
+    answer = asked.answer({"score": {name: rows.tolist() for name, rows in states.items()}})
+    assert "is of another configuration" in answer["error"]
+    with pytest.raises(UserError, match="is of another configuration: it has no ppo.nothing"):
+        run.checkpoints.part("ppo.nothing")
+
+
+def test_what_is_not_there_is_answered_by_a_sentence(run, tmp_path):
+    asked = served.Served(run, tmp_path)
+    assert "cannot be read" in asked.answer({"policy": 77, "best": False})["error"]
+    assert "has no checkpoint in best/" in asked.answer({"policy": None, "best": True})["error"]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_reader_asks_a_process(run, states, tmp_path):
+    reader = Reader(run.folder)
+    path = reader.policy(0)
+    assert read_npz(path).robot == "unitree_g1"
+    score, demonstration = reader.score(states["qpos"], states["qvel"])
+    assert np.isfinite([score, demonstration]).all()
+    with pytest.raises(UserError, match="cannot be read"):
+        reader.policy(77)
+    reader.close()
+    assert not path.exists()
+    with pytest.raises(UserError, match=r"run \S*none cannot be read: .*none is not a run folder"):
+        Reader(tmp_path / "none").policy(0)
+
+
+def test_a_run_that_trains_writes_its_policy_now_and_then(run, monkeypatch):
+    started, now = [], [100.0]
+    page = SimpleNamespace(terminate=lambda: started.append("ended"), wait=lambda: None)
+    monkeypatch.setattr(served.subprocess, "Popen", lambda command, **_: started.append(command) or page)
+    monkeypatch.setattr(served.time, "monotonic", lambda: now[0])
+    session = SimpleNamespace(states=[run.trainer().init()], trainer=run.trainer(), done=0)
+    file = run.folder / policy.LIVE
+    with served.Live([run], port=8123) as live:
+        live.open(session)
+        assert started[0][1:] == ["-m", "fmpjax.cli", "play", str(run.folder), "--checkpoint", "live", "--port", "8123"]
+        assert read_npz(file).robot == "unitree_g1" and policy.metadata(file)["iteration"] == "0"
+        session.done, now[0] = 2, 101.0
+        live.show(session)
+        assert policy.metadata(file)["iteration"] == "0"
+        now[0] = 106.0
+        live.show(session)
+        assert policy.metadata(file)["iteration"] == "2"
+    assert started[1:] == ["ended"] and not file.exists()
+    assert json.loads((run.folder / "config.json").read_text())  # nothing else has changed
