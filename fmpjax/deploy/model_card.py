@@ -1,5 +1,6 @@
 """The card for the people who run a policy."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,14 @@ _UNMEASURED = {
     "key_points": "the places of key points",
     "heading_linear_velocity": "the root's linear velocity",
     "heading_key_points": "the places of key points",
+}
+# Rows of the table of obedience, by their names in steering.json.
+_STEERING = {
+    "mean error of the speed, m/s": "speed_error",
+    "mean error of the turning, rad/s": "turn_error",
+    "falls": "falls",
+    "episodes": "episodes",
+    "seconds of an episode": "seconds",
 }
 _CARD = """# {run}
 
@@ -37,7 +46,7 @@ At most {transitions:,} transitions, reset `{reset}`, physics at {physics_rate:g
 ## Robustness
 
 {robustness}
-
+{steering}
 ## Observation
 
 `obs` has {size} numbers, not normalized:
@@ -121,7 +130,8 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
         physics_rate=1.0 / config.physics.timestep,
         motions="\n".join(tables.row((Path(name).name, f"{w:g}", _license(name))) for name, w in origin.motions),
         evaluation=_evaluated(origin.evaluation),
-        robustness=_robustness(origin.evaluation),
+        robustness=_robustness(origin.evaluation, origin.robustness),
+        steering=_steering(origin.steering),
         size=start,
         observation="\n".join(rows),
         joints=len(policy.joint_names),
@@ -149,18 +159,37 @@ def _evaluated(figures: dict[str, Any] | None) -> str:
     )
 
 
-def _robustness(figures: dict[str, Any] | None) -> str:
+def _robustness(figures: dict[str, Any] | None, tried: Sequence[dict[str, Any]]) -> str:
     starts = (figures or {}).get("starts") or []
     rows = [tables.row((f"{start['noise']:g}", str(start["falls"]), str(start["episodes"]))) for start in starts]
-    if not rows:
-        return "No disturbance was tried on this policy."
-    return "\n".join(
-        [
-            "Falls by the noise of the joint angles at the start, rad; ten times that, rad/s, of their velocities. "
-            "Pushes, delays and other floors were not tried.",
-            "",
-            "| noise | falls | first episodes |",
-            "|---|---|---|",
-            *rows,
+    parts = []
+    if rows:
+        also = "" if tried else " Pushes, delays and other floors were not tried."
+        parts += [
+            "Falls by the noise of the joint angles at the start, rad; ten times that, rad/s, of their velocities."
+            + also,
+            "\n".join(["| noise | falls | first episodes |", "|---|---|---|", *rows]),
         ]
-    )
+    if tried:
+        names = list(dict.fromkeys(name for row in tried for name in row))
+        cells = [[_cell(row.get(name)) for name in names] for row in tried]
+        parts.append(tables.markdown([name.replace("_", " ") for name in names], cells))
+    return "\n\n".join(parts) or "No disturbance was tried on this policy."
+
+
+def _steering(figures: dict[str, Any] | None) -> str:
+    """The section on how the policy obeys; empty where that was not measured."""
+    if figures is None:
+        return ""
+    rows = [
+        (label, *(_cell(figures.get(f"{kind}{name}")) for kind in ("", "changing_")))
+        for label, name in _STEERING.items()
+    ]
+    table = tables.markdown(("", "constant commands", "changing commands"), rows)
+    return f"\n## Steering\n\n{table}\n"
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return "undefined" if value is None else str(value).replace("|", "/").replace("\n", " ")

@@ -1,6 +1,6 @@
 """Where a policy comes from."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from fmpjax.config import Config
@@ -17,6 +17,8 @@ class Origin(NamedTuple):
     changed: bool = False  # whether the program had changes that the commit does not have
     # Of a policy that takes velocities as commands: low and high of lin_vel_x, lin_vel_y (m/s) and ang_vel_z (rad/s).
     commands: Mapping[str, tuple[float, float]] | None = None
+    steering: dict[str, Any] | None = None  # what steering.json says
+    robustness: Sequence[dict[str, Any]] = ()  # what robustness.json says, a row per disturbance that was tried
 
     @property
     def version(self) -> str:

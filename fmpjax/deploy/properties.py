@@ -37,6 +37,7 @@ def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
     }
     return mjlab | {
         "observation_widths": _list(terms.values()),
+        "command_ranges": _list(f"{low};{high}" for low, high in (origin.commands or {}).values()),
         "action_offset": _list(policy.center),
         "action_clip": _pairs(policy.low, policy.high),
         "joint_effort": _list(robot.effort),
