@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import fmpjax
-from fmpjax import features, tables
+from fmpjax import features, resources, tables
 from fmpjax.deploy.origin import Origin
-from fmpjax.motion import bundled
+from fmpjax.errors import UserError
+from fmpjax.motion.formats import locate
 from fmpjax.policy import Policy
 from fmpjax.robots import Robot
 
@@ -128,7 +129,7 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
         transitions=config.transitions,
         reset=config.env.reset,
         physics_rate=1.0 / config.physics.timestep,
-        motions="\n".join(tables.row((Path(name).name, f"{w:g}", _license(name))) for name, w in origin.motions),
+        motions="\n".join(tables.row((Path(name).name, f"{w:g}", _license(name, robot))) for name, w in origin.motions),
         evaluation=_evaluated(origin.evaluation),
         robustness=_robustness(origin.evaluation, origin.robustness),
         steering=_steering(origin.steering),
@@ -142,8 +143,12 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
     )
 
 
-def _license(motion: str) -> str:
-    return "MIT, bundled with fmpjax" if motion in bundled() else "unknown: ask the motion's source"
+def _license(name: str, robot: Robot) -> str:
+    try:
+        shipped = locate(name, robot.name).is_relative_to(resources.folder("motions"))
+    except UserError:  # the file is no longer where it was
+        shipped = False
+    return "MIT, bundled with fmpjax" if shipped else "unknown: ask the motion's source"
 
 
 def _evaluated(figures: dict[str, Any] | None) -> str:

@@ -134,6 +134,8 @@ def test_the_card_says_licenses_evaluation_and_what_is_not_measured(robot, walk)
     assert "| walk | 1 | MIT, bundled with fmpjax |" in card
     assert "| secret.csv | 0.5 | unknown: ask the motion's source |" in card
     assert "The run has no evaluation of this policy" in card
+    of_a_folder = deploy.card(made.policy, robot, made.origin._replace(motions=(("gaits/+0.00_+0.40", 1.0),)))
+    assert "| +0.00_+0.40 | 1 | MIT, bundled with fmpjax |" in of_a_folder
     assert deploy.unmeasured(robot, "compact") in card.replace("The policy observes", "the policy observes")
     assert all(f"| `{joint}` |" in card for joint in robot.joint_names)
     figures = {"falls": 3, "episodes": 64, "late_speed": None, "demonstration_speed": 0.8578}
@@ -168,6 +170,7 @@ def test_the_card_has_the_tables_of_obedience_and_of_disturbances(robot, walk):
 def test_figures_that_cannot_be_read_are_refused(tmp_path, name, text):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.json").write_text(config.to_json(preset("smoke")))
+    (tmp_path / "run" / "provenance.json").write_text("{}")
     run = runs.Run.open(tmp_path / "run")
     (run.folder / name).write_text(text)
     with pytest.raises(UserError, match=rf"run/{name} is not as `fmpjax evaluate` writes it: expected JSON, a"):

@@ -33,7 +33,7 @@ STEERED = {"env.observation": "compact", "env.axes": "heading", "command.kind": 
 RANGES = {"lin_vel_x": (0.0, 1.2), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (-0.8, 0.8)}
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 TOLD = [0.5, 0.0, -0.3]  # m/s ahead and to the left, rad/s
-CLOSE = 1e-6  # rad, m and their rates: how far the page's robot may be from sim2sim's after STEPS steps of control
+CLOSE = 1e-5  # rad, m and their rates: how far the page's robot may be from sim2sim's after STEPS steps of control
 STEPS = 10
 
 

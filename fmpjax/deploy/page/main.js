@@ -12,6 +12,7 @@ const COMMANDS = [
   { label: "turn", unit: "rad/s", keys: ["KeyD", "KeyA"] },
 ];
 const PUSHES = { ArrowUp: [1, 0], ArrowDown: [-1, 0], ArrowLeft: [0, 1], ArrowRight: [0, -1] };
+const NARROW = 0.05; // m/s or rad/s: a range below it is that of a training that did not vary this part
 const KEY_PARTS = 5; // key presses from zero to the end of a range
 
 const $ = (id) => document.getElementById(id);
@@ -54,8 +55,8 @@ class Page {
     $("commands").hidden = false;
     this.sliders = COMMANDS.map(({ label, unit }, i) => {
       const [low, high] = ranges[i];
-      if (low === high) return null;
-      const row = document.createElement("label");
+      if (high - low < NARROW) return null;
+      const row = Object.assign(document.createElement("label"), { className: "slider" });
       const slider = Object.assign(document.createElement("input"), { type: "range", min: low, max: high, step: 0.01 });
       const value = document.createElement("output");
       slider.id = `command-${label}`;

@@ -62,11 +62,10 @@ export class View {
     return found;
   }
 
-  /** Show what collides in place of what the eye sees. */
-  showShapes(colliding) {
-    const { model } = this.sim;
+  /** Show what touches and what marks a fall in place of what the eye sees. */
+  showShapes(bare) {
     for (const { mesh, geom, looks, plane } of this.shapes) {
-      mesh.visible = plane || (colliding ? model.geom_contype[geom] + model.geom_conaffinity[geom] > 0 : looks);
+      mesh.visible = plane || (bare ? this.sim.model.geom_group[geom] >= LOOKS : looks);
     }
   }
 
