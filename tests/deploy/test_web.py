@@ -284,7 +284,7 @@ def test_the_first_steps_are_those_of_sim2sim(real):
     """The page's own code, MuJoCo and ONNX Runtime in WebAssembly, by Node.js."""
     (real.folder / "package.json").write_text('{"type": "module"}')
     (real.folder / "test.js").write_text(NODE.replace("TOLD", json.dumps(TOLD)).replace("STEPS", str(STEPS)))
-    done = subprocess.run(["node", "test.js"], cwd=real.folder, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(["node", "test.js"], cwd=real.folder, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     states = np.array(json.loads((real.folder / "states.json").read_text()))
     np.testing.assert_allclose(states, real.states, atol=CLOSE)
@@ -313,12 +313,13 @@ def test_the_page_runs_in_a_browser(real):
     with served(real.folder) as address, api.sync_playwright() as play:
         browser = play.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--enable-unsafe-swiftshader"])
         tab = browser.new_page(viewport={"width": 640, "height": 480})
+        tab.set_default_timeout(300_000)
         asked, said = [], []
         tab.on("request", lambda request: asked.append(request.url))
         tab.on("console", lambda message: said.append(message.text))
         tab.on("pageerror", lambda error: said.append(str(error)))
         tab.goto(address)
-        tab.wait_for_function("globalThis.page !== undefined", timeout=60_000)
+        tab.wait_for_function("globalThis.page !== undefined")
         tab.click("#pause")
         states = np.array(
             tab.evaluate(
@@ -346,7 +347,7 @@ def test_the_page_runs_in_a_browser(real):
         tab.click("#reset")
         tab.wait_for_function("page.sim.time === 0")
         tab.click("#pause")
-        tab.wait_for_function("page.sim.time > 0.1 || page.falls > 0", timeout=60_000)
+        tab.wait_for_function("page.sim.time > 0.1 || page.falls > 0")
         assert all(url.startswith((address, "data:")) for url in asked)
         assert [line for line in said if "GPU" not in line and "GL" not in line] == []
         browser.close()
