@@ -120,22 +120,28 @@ class Render:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Copy a run's results, without its states, to a folder."""
+    """Copy a run's results, without its states, to a folder, or write a page of its policy."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
-    out: tyro.conf.Positional[Path]
+    out: Annotated[tyro.conf.Positional[Path | None], default("RUN/export")] = None
     """Folder to write."""
     onnx: bool = False
     """Write policy.onnx and MODEL_CARD.md, too, for other programs; docs/deploy.md."""
+    web: Annotated[Path | None, default("no page")] = None
+    """New folder for a page on which the policy runs in a browser; alone it is all that is written."""
 
     def __call__(self) -> None:
         runs = runs_module()
         from fmpjax import deploy, features, robots
 
         run = runs.Run.open(self.run)
-        for path in runs.export(run, self.out, onnx=self.onnx):
-            print(f"wrote {path}")
+        if self.web is None or self.onnx or self.out is not None:
+            for path in runs.export(run, self.out or run.folder / "export", onnx=self.onnx):
+                print(f"wrote {path}")
+        if self.web is not None:
+            runs.web(run, self.web)
+            print(f"wrote {self.web}, a page: see it with `python -m http.server --directory {self.web}`")
         config = run.config
         for say in (deploy.unmeasured, deploy.no_stock) if self.onnx else ():
             if sentence := say(robots.load(config.robot), features.observation_form(config)):

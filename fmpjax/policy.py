@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from fmpjax.acting import of_actor
 from fmpjax.errors import UserError
 
 if TYPE_CHECKING:
@@ -69,6 +68,8 @@ class Policy(NamedTuple):
 
 def of(trainer: "Trainer", state: "PPOState") -> Policy:
     """The policy of a training state."""
+    from fmpjax.acting import of_actor  # brings JAX, which a policy does without
+
     config, robot, actions = trainer.config, trainer.robot, trainer.env.actions
     kernels, biases = zip(*trainer.ppo.layers(state.actor), strict=True)
     return Policy(

@@ -1,8 +1,10 @@
 """What several tests make: the smallest run, and the smallest rollout for a prior."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
+import numpy as np
 
 from fmpjax.config import AMPConfig, Config, EnvConfig, GAILConfig, PriorConfig, SMPConfig, WAILConfig, preset
 from fmpjax.priors import Expert, Rollout
@@ -58,3 +60,28 @@ def rollout_of(points, valid=None):
     points = jnp.asarray(points, jnp.float32)
     valid = jnp.ones((STEPS, COUNT), bool) if valid is None else jnp.asarray(valid)
     return Rollout(points.reshape(STEPS, COUNT, -1), valid, jnp.zeros((STEPS, COUNT), bool))
+
+
+def small_policy(robot, walk, **changes):
+    """An untrained policy of random layers, and what a run has beside it."""
+    from fmpjax import deploy, features, policy
+    from fmpjax.env import action_map
+
+    settings = tiny(**changes)
+    form = features.observation_form(settings)
+    size, random = sum(features.observation_terms(robot, form).values()), np.random.default_rng(0)
+    shapes = [(size, 16), (16, 12), (12, robot.joint_count)]
+    made = policy.Policy(
+        joint_names=robot.joint_names,
+        observation=form,
+        rate=settings.control_rate,
+        activation=settings.ppo.activation,
+        kernels=tuple(random.normal(0, 0.5 / np.sqrt(shape[0]), shape).astype(np.float32) for shape in shapes),
+        biases=tuple(random.normal(0, 0.2, shape[1]).astype(np.float32) for shape in shapes),
+        mean=random.normal(0, 0.3, size).astype(np.float32),
+        deviation=random.uniform(0.5, 2.0, size).astype(np.float32),
+        clip=2.0,
+        **{k: np.asarray(v, np.float32) for k, v in action_map(robot, walk, settings.env.action)._asdict().items()},
+    )
+    origin = deploy.Origin("run", settings, (("walk", 1.0), ("/mine/secret.csv", 0.5)), "abc123", None)
+    return SimpleNamespace(config=settings, policy=made, origin=origin, size=size)

@@ -43,6 +43,8 @@ def test_wheel_holds_the_package_and_nothing_beside_it(wheel):
     modules = {path.relative_to(ROOT).as_posix() for path in (ROOT / "fmpjax").rglob("*.py")}
     assert modules == {name for name in names if name.endswith(".py")}
     assert "fmpjax/py.typed" in names
+    page = ROOT / "fmpjax" / "deploy" / "page"
+    assert {path.relative_to(ROOT).as_posix() for path in page.iterdir()} <= set(names)
 
 
 def test_installed_wheel_loads_the_robot_away_from_the_checkout(wheel, tmp_path):

@@ -11,6 +11,7 @@ from fmpjax.deploy.network import check_widths, graph
 from fmpjax.deploy.origin import Origin
 from fmpjax.deploy.properties import metadata
 from fmpjax.deploy.unitree import no_stock, stock
+from fmpjax.deploy.web import write_page
 
 __all__ = [
     "Origin",
@@ -23,4 +24,5 @@ __all__ = [
     "stock",
     "unmeasured",
     "write",
+    "write_page",
 ]

@@ -15,21 +15,21 @@ from fmpjax.policy import Policy
 from fmpjax.robots import Robot
 
 
-def check_installed() -> None:
-    """Refuse where the package onnx is missing.
+def check_installed(option: str = "--onnx") -> None:
+    """Refuse where the package onnx is missing, which ``option`` needs.
 
     Raises:
       UserError: it is.
     """
     if importlib.util.find_spec("onnx") is None:
-        raise UserError("--onnx needs the package onnx, which is not installed: install the extra fmpjax[deploy]")
+        raise UserError(f"{option} needs the package onnx, which is not installed: install the extra fmpjax[deploy]")
 
 
-def write(folder: Path, policy: Policy, robot: Robot, origin: Origin) -> list[Path]:
+def write(folder: Path, policy: Policy, robot: Robot, origin: Origin, *, unitree: bool = True) -> list[Path]:
     """Write ``policy.onnx`` and ``MODEL_CARD.md`` into ``folder``; the paths written.
 
     Where Unitree's stock program can run the policy, ``params/deploy.yaml`` and ``exported/policy.onnx``, too, where
-    that program looks for them.
+    that program looks for them, unless ``unitree`` is false.
 
     Raises:
       UserError: the widths of observation, layers and joints do not fit together, or a number is not finite.
@@ -44,7 +44,7 @@ def write(folder: Path, policy: Policy, robot: Robot, origin: Origin) -> list[Pa
     onnx.save(model, folder / "policy.onnx")
     (folder / "MODEL_CARD.md").write_text(card(policy, robot, origin))
     paths = [folder / "policy.onnx", folder / "MODEL_CARD.md"]
-    if no_stock(robot, policy.observation) is None:
+    if unitree and no_stock(robot, policy.observation) is None:
         for path in (exported := folder / "exported" / "policy.onnx", settings := folder / "params" / "deploy.yaml"):
             path.parent.mkdir(exist_ok=True)
         settings.write_text(stock(policy, robot, origin))

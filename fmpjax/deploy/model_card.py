@@ -4,9 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import fmpjax
-from fmpjax import features, tables
+from fmpjax import features, resources, tables
 from fmpjax.deploy.origin import Origin
-from fmpjax.motion import bundled
+from fmpjax.errors import UserError
+from fmpjax.motion.formats import locate
 from fmpjax.policy import Policy
 from fmpjax.robots import Robot
 
@@ -16,6 +17,14 @@ _UNMEASURED = {
     "key_points": "the places of key points",
     "heading_linear_velocity": "the root's linear velocity",
     "heading_key_points": "the places of key points",
+}
+# Rows of the table of obedience, by their names in steering.json.
+_STEERING = {
+    "mean error of the speed, m/s": "speed_error",
+    "mean error of the turning, rad/s": "turn_error",
+    "falls": "falls",
+    "episodes": "episodes",
+    "seconds of an episode": "seconds",
 }
 _CARD = """# {run}
 
@@ -37,7 +46,7 @@ At most {transitions:,} transitions, reset `{reset}`, physics at {physics_rate:g
 ## Robustness
 
 {robustness}
-
+{steering}
 ## Observation
 
 `obs` has {size} numbers, not normalized:
@@ -122,9 +131,10 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
         transitions=config.transitions,
         reset=config.env.reset,
         physics_rate=1.0 / config.physics.timestep,
-        motions="\n".join(tables.row((Path(name).name, f"{w:g}", _license(name))) for name, w in origin.motions),
+        motions="\n".join(tables.row((Path(name).name, f"{w:g}", _license(name, robot))) for name, w in origin.motions),
         evaluation=_evaluated(origin.evaluation),
         robustness=_robustness(origin.evaluation, origin.robustness),
+        steering=_steering(origin.steering),
         size=start,
         observation="\n".join(rows),
         joints=len(policy.joint_names),
@@ -135,8 +145,12 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
     )
 
 
-def _license(motion: str) -> str:
-    return "MIT, bundled with fmpjax" if motion in bundled() else "unknown: ask the motion's source"
+def _license(name: str, robot: Robot) -> str:
+    try:
+        shipped = locate(name, robot.name).is_relative_to(resources.folder("motions"))
+    except UserError:  # the file is no longer where it was
+        shipped = False
+    return "MIT, bundled with fmpjax" if shipped else "unknown: ask the motion's source"
 
 
 def _evaluated(figures: dict[str, Any] | None) -> str:
@@ -172,3 +186,21 @@ def _robustness(figures: dict[str, Any] | None, robustness: dict[str, Any] | Non
             *rows,
         ]
     return "\n".join(parts).rstrip() or "No disturbance was tried on this policy."
+
+
+def _steering(figures: dict[str, Any] | None) -> str:
+    """The section on how the policy obeys; empty where that was not measured."""
+    if figures is None:
+        return ""
+    rows = [
+        (label, *(_cell(figures.get(f"{kind}{name}")) for kind in ("", "changing_")))
+        for label, name in _STEERING.items()
+    ]
+    table = tables.markdown(("", "constant commands", "changing commands"), rows)
+    return f"\n## Steering\n\n{table}\n"
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return "undefined" if value is None else str(value).replace("|", "/").replace("\n", " ")

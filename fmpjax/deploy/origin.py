@@ -17,6 +17,7 @@ class Origin(NamedTuple):
     changed: bool = False  # whether the program had changes that the commit does not have
     # Of a policy that takes velocities as commands: low and high of lin_vel_x, lin_vel_y (m/s) and ang_vel_z (rad/s).
     commands: Mapping[str, tuple[float, float]] | None = None
+    steering: dict[str, Any] | None = None  # what steering.json says
     robustness: dict[str, Any] | None = None  # what robustness.json says
 
     @property

@@ -38,6 +38,7 @@ def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
     }
     return mjlab | {
         "observation_widths": _list(terms.values()),
+        "command_ranges": _list(f"{low};{high}" for low, high in (origin.commands or {}).values()),
         "action_offset": _list(policy.center),
         "action_clip": _pairs(policy.low, policy.high),
         "joint_effort": _list(robot.effort),
@@ -62,7 +63,6 @@ def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
         "integrator": sim2sim.integrator(trained),
         **{name: _list(";".join(map(str, np.ravel(row))) for row in rows) for name, rows in facts.items()},
         "total_mass": str(robot.total_mass),
-        "command_ranges": _list(f"{low};{high}" for low, high in (origin.commands or {}).values()),
         "robot": robot.name,
         "method": origin.config.method,
         "motions": _list(Path(name).name for name, _ in origin.motions),

@@ -4,7 +4,7 @@ from fmpjax.files import without_places, write
 from fmpjax.provenance import machine, provenance
 from fmpjax.runs.clock import End
 from fmpjax.runs.folder import Run, check_trainable, default_folder, default_preset, describe, load_motion
-from fmpjax.runs.outputs import export, finish, video
+from fmpjax.runs.outputs import export, finish, video, web
 from fmpjax.runs.served import Live
 from fmpjax.runs.training import train
 
@@ -23,6 +23,7 @@ __all__ = [
     "provenance",
     "train",
     "video",
+    "web",
     "without_places",
     "write",
 ]

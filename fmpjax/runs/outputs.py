@@ -19,8 +19,8 @@ from fmpjax.trainer import Trainer
 from fmpjax.viz import curves, render
 
 _EXPORTED = (
-    "metrics.csv evaluation.json robustness.json robustness.png ranking-start.json ranking.json curves.png frames.png "
-    "policy.mp4 policy.gif"
+    "metrics.csv evaluation.json steering.json robustness.json ranking-start.json ranking.json curves.png steering.png "
+    "robustness.png frames.png policy.mp4 policy.gif"
 ).split()
 
 
@@ -72,9 +72,7 @@ def export(run: Run, out: Path, *, onnx: bool = False) -> list[Path]:
     """
     trained = bool(run.checkpoints.iterations() or run.checkpoints.iterations(best=True))
     if onnx:
-        deploy.check_installed()
-        if not trained:
-            raise UserError(f"run {run.folder} has no checkpoint: expected one, of which --onnx takes the policy")
+        _check_deployable(run, "--onnx")
     if out.resolve() == run.folder.resolve():
         raise UserError(f"{out} is the run itself: expected another folder")
     # Where the demonstration and the run lay is this machine's affair; their names are everybody's.
@@ -102,27 +100,54 @@ def export(run: Run, out: Path, *, onnx: bool = False) -> list[Path]:
         raise UserError(f"folder {out} cannot be written: {error.strerror}") from None
 
 
+def web(run: Run, folder: Path) -> list[Path]:
+    """Write a page on which the run's policy runs in a browser into a new ``folder``; the paths written.
+
+    Raises:
+      UserError: there is no policy, or `fmpjax.deploy.write_page` refuses it, or ``folder`` cannot be written.
+    """
+    _check_deployable(run, "--web")
+    trainer, state = run.policy()
+    try:
+        return deploy.write_page(folder, policy.of(trainer, state.ppo), trainer.robot, origin_of(run))
+    except OSError as error:
+        raise UserError(f"folder {folder} cannot be written: {error.strerror}") from None
+
+
+def _check_deployable(run: Run, option: str) -> None:
+    """Refuse a run without a policy for other programs, or without the packages that ``option`` needs."""
+    deploy.check_installed(option)
+    if not (run.checkpoints.iterations() or run.checkpoints.iterations(best=True)):
+        raise UserError(f"run {run.folder} has no checkpoint: expected one, of which {option} takes the policy")
+
+
 def origin_of(run: Run) -> deploy.Origin:
     """Where the run's policy comes from, as its ONNX file and its card say."""
-    evaluation, robustness = (_figures(run.folder / name) for name in ("evaluation.json", "robustness.json"))
     return deploy.Origin(
         run=run.folder.resolve().name,
         config=run.config,
         motions=tuple(run.motions(run.config)),
         commit=run.provenance().get("commit"),
-        evaluation=evaluation,
+        evaluation=_measured(run, "evaluation.json"),
         changed=bool(run.provenance().get("uncommitted_changes")),
         commands=_commands(run),
-        robustness=robustness,
+        steering=_measured(run, "steering.json"),
+        robustness=_measured(run, "robustness.json"),
     )
 
 
-def _figures(path: Path) -> dict[str, Any] | None:
-    """What an evaluation wrote; None where it was not made."""
+def _measured(run: Run, name: str) -> dict[str, Any] | None:
+    """What ``fmpjax evaluate`` wrote into a file of the run; None where it did not."""
+    path = run.folder / name
+    if not path.exists():
+        return None
     try:
-        return json.loads(path.read_text()) if path.exists() else None
+        figures = json.loads(path.read_text())
     except ValueError:
-        raise UserError(f"{path} is not valid JSON: expected what `fmpjax evaluate` writes") from None
+        figures = None
+    if not isinstance(figures, dict):
+        raise UserError(f"{path} is not as `fmpjax evaluate` writes it: expected JSON, an object of figures")
+    return figures
 
 
 def _commands(run: Run) -> dict[str, tuple[float, float]] | None:

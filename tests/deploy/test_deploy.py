@@ -21,7 +21,8 @@ from fmpjax.env import action_map
 from fmpjax.errors import UserError
 from fmpjax.physics.native import NativePhysics
 from fmpjax.ppo import PPO
-from tests.helpers import tiny
+from fmpjax.runs import outputs
+from tests.helpers import small_policy as small
 
 
 def importable(*names):
@@ -29,28 +30,6 @@ def importable(*names):
 
 
 needs_onnx = pytest.mark.skipif(not importable("onnx", "onnxruntime"), reason="the extra deploy is not installed")
-
-
-def small(robot, walk, **changes):
-    """An untrained policy of random layers, and what a run has beside it."""
-    settings = tiny(**changes)
-    form = features.observation_form(settings)
-    size, random = sum(features.observation_terms(robot, form).values()), np.random.default_rng(0)
-    shapes = [(size, 16), (16, 12), (12, robot.joint_count)]
-    made = policy.Policy(
-        joint_names=robot.joint_names,
-        observation=form,
-        rate=settings.control_rate,
-        activation=settings.ppo.activation,
-        kernels=tuple(random.normal(0, 0.5 / np.sqrt(shape[0]), shape).astype(np.float32) for shape in shapes),
-        biases=tuple(random.normal(0, 0.2, shape[1]).astype(np.float32) for shape in shapes),
-        mean=random.normal(0, 0.3, size).astype(np.float32),
-        deviation=random.uniform(0.5, 2.0, size).astype(np.float32),
-        clip=2.0,
-        **{k: np.asarray(v, np.float32) for k, v in action_map(robot, walk, settings.env.action)._asdict().items()},
-    )
-    origin = deploy.Origin("run", settings, (("walk", 1.0), ("/mine/secret.csv", 0.5)), "abc123", None)
-    return SimpleNamespace(config=settings, policy=made, origin=origin, size=size)
 
 
 def session(path):
@@ -155,6 +134,8 @@ def test_the_card_says_licenses_evaluation_and_what_is_not_measured(robot, walk)
     assert "| walk | 1 | MIT, bundled with fmpjax |" in card
     assert "| secret.csv | 0.5 | unknown: ask the motion's source |" in card
     assert "The run has no evaluation of this policy" in card
+    of_a_folder = deploy.card(made.policy, robot, made.origin._replace(motions=(("gaits/+0.00_+0.40", 1.0),)))
+    assert "| +0.00_+0.40 | 1 | MIT, bundled with fmpjax |" in of_a_folder
     assert deploy.unmeasured(robot, "compact") in card.replace("The policy observes", "the policy observes")
     assert all(f"| `{joint}` |" in card for joint in robot.joint_names)
     figures = {"falls": 3, "episodes": 64, "late_speed": None, "demonstration_speed": 0.8578}
@@ -164,6 +145,35 @@ def test_the_card_says_licenses_evaluation_and_what_is_not_measured(robot, walk)
     figures["starts"] = [{"noise": 0.0, "falls": 0, "episodes": 1}, {"noise": 0.01, "falls": 7, "episodes": 21}]
     card = deploy.card(made.policy, robot, made.origin._replace(evaluation=figures, changed=True))
     assert "| 0 | 0 | 1 |\n| 0.01 | 7 | 21 |\n" in card and "commit abc123 with changes" in card
+
+
+def test_the_card_has_the_tables_of_obedience_and_of_disturbances(robot, walk):
+    made = small(robot, walk)
+    assert "## Steering" not in deploy.card(made.policy, robot, made.origin)
+    steering = {"speed_error": 0.12345, "turn_error": None, "falls": 2, "changing_falls": 1, "cells": []}
+    tried = {"cells": [{"disturbance": "push", "size": "1 m/s", "falls": 3, "episodes": 64}]}
+    card = deploy.card(made.policy, robot, made.origin._replace(steering=steering, robustness=tried))
+    assert "| mean error of the speed, m/s | 0.123 | undefined |\n" in card
+    assert "| mean error of the turning, rad/s | undefined | undefined |\n" in card
+    assert "| falls | 2 | 1 |" in card
+    assert "| push | 1 m/s | 3 | 64 |" in card and "No disturbance was tried" not in card
+    figures = {"falls": 0, "episodes": 4, "starts": [{"noise": 0.0, "falls": 0, "episodes": 1}]}
+    card = deploy.card(made.policy, robot, made.origin._replace(evaluation=figures, robustness=tried))
+    assert "| 0 | 0 | 1 |" in card and "were not tried" not in card
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("steering.json", "[]"), ("robustness.json", "[1]"), ("evaluation.json", "{")],
+)
+def test_figures_that_cannot_be_read_are_refused(tmp_path, name, text):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text(config.to_json(preset("smoke")))
+    (tmp_path / "run" / "provenance.json").write_text("{}")
+    run = runs.Run.open(tmp_path / "run")
+    (run.folder / name).write_text(text)
+    with pytest.raises(UserError, match=rf"run/{name} is not as `fmpjax evaluate` writes it: expected JSON, a"):
+        outputs.origin_of(run)
 
 
 @pytest.mark.parametrize("name", ["unitree_g1", "unitree_g1_29dof", "strider"])
