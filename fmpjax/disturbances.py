@@ -210,14 +210,14 @@ def _check_torso(robot: Robot, config: DisturbanceConfig) -> None:
 def _sizes(config: DisturbanceConfig, rate: float, count: int) -> Sizes:
     noise = (config.turn_noise, config.tilt_noise, config.angle_noise, config.velocity_noise)
     pushed = bool(config.push_interval)
-    sizes = Sizes(
+    sizes: dict[str, Any] = dict(
         delay=config.delay or (0, 0),
         noise=noise,
         interval=[max(1, round(rate * seconds)) for seconds in config.push_interval] if pushed else (_NEVER, _NEVER),
         speed=config.push_speed if pushed else (0.0, 0.0),
         spin=(config.push_lift, config.push_tilt, config.push_turn) if pushed else (0.0, 0.0, 0.0),
     )
-    return Sizes(*(jnp.tile(jnp.asarray(size, jnp.float32), (count, 1)) for size in sizes))
+    return Sizes(**{name: jnp.tile(jnp.asarray(size, jnp.float32), (count, 1)) for name, size in sizes.items()})
 
 
 def _body(config: DisturbanceConfig, frictionloss: float, key: jax.Array, count: int, joints: int) -> Traits:

@@ -153,6 +153,7 @@ class Env:
 
     def _revealed(self, actor: jax.Array, command: Any, disturbed: disturbances.State) -> jax.Array:
         """What a critic sees with disturbances, ``[N, C]``: all that is true."""
+        assert self.disturbances is not None
         more = [self.command.reveal(command)] if self.command and self.command.reveal else []
         return jnp.concatenate([self.seen(actor, command), *more, self.disturbances.reveal(disturbed)], axis=-1)
 

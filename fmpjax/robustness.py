@@ -22,8 +22,8 @@ EVERY = 2.0  # s between two pushes where pushes are alone
 Z = 1.959964  # standard deviations on either side of a 95 % interval
 
 # What peers set for the G1; docs/robustness.md.
-NOISE = {"turn_noise": 0.2, "tilt_noise": 0.05, "angle_noise": 0.01, "velocity_noise": 1.5}
-SPIN = {"push_lift": 0.4, "push_tilt": 0.52, "push_turn": 0.78}
+NOISE: dict[str, Any] = {"turn_noise": 0.2, "tilt_noise": 0.05, "angle_noise": 0.01, "velocity_noise": 1.5}
+SPIN: dict[str, Any] = {"push_lift": 0.4, "push_tilt": 0.52, "push_turn": 0.78}
 # mjlab draws a push of up to 0.5 m/s on each axis: 0.38 m/s on average, 0.71 m/s at most, as here in any direction.
 MJLAB = DisturbanceConfig(
     friction=(0.3, 1.2),
@@ -101,7 +101,7 @@ def cases(config: Config) -> list[Case]:
         ],
         "slope": [(f"to {v:g} rad", {"slope": v}) for v in (0.03, 0.06, 0.12)],
     }
-    pushed = {"push_interval": (EVERY, EVERY)}
+    pushed: dict[str, Any] = {"push_interval": (EVERY, EVERY)}
     found = [Case("none", "", DisturbanceConfig())]
     for name, sizes in alone.items():
         found += [
@@ -157,6 +157,7 @@ class Player:
 
     def play(self, state: PPOState, config: DisturbanceConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Episodes under the mean action: ``qpos [T, N, 7 + J]``, lengths ``[N]`` in steps, and falls ``[N]``."""
+        assert self.env.disturbances is not None, "the evaluation's own configuration has every disturbance"
         disturbed = self.env.disturbances.init(jax.random.fold_in(self._key, 3), self.count, config)
         disturbed = disturbed._replace(share=jnp.ones_like(disturbed.share))
         alive = jnp.ones(self.count, bool)

@@ -31,9 +31,9 @@ class Traits(NamedTuple):
         return jnp.concatenate(self, axis=-1)
 
 
-def widths(joints: int) -> Traits:
-    """Numbers of each trait of one robot."""
-    return Traits(1, 1, 3, joints, joints, joints, joints, joints, 2)
+def widths(joints: int) -> tuple[int, ...]:
+    """Numbers of each trait of one robot, in the order of `Traits`."""
+    return (1, 1, 3, joints, joints, joints, joints, joints, 2)
 
 
 def unpacked(row: Any) -> Traits:
