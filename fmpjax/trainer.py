@@ -120,6 +120,7 @@ class Trainer:
             | {f"fit/{name}": value for name, value in prior_metrics.items()}
             | {f"ppo/{name}": value for name, value in ppo_metrics.items()}
             | command_metrics
+            | ({"env/push_share": env.disturbed.share.mean()} if self.env.disturbances else {})
             | {"train/nonfinite": nonfinite}
         )
         figures = {name: jnp.asarray(value, jnp.float32) for name, value in figures.items()}
