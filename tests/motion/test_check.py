@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import time
 
 import mujoco
@@ -12,7 +13,7 @@ from PIL import Image
 from fmpjax import cli, motion, robots, rotations
 from fmpjax import config as configuration
 from fmpjax.errors import UserError
-from fmpjax.motion import MotionClip, check, edit, segment, soles
+from fmpjax.motion import MotionClip, check, edit, library, segment, soles
 from fmpjax.viz import clip as show
 
 
@@ -312,7 +313,12 @@ def test_import_check_and_synthesize(tmp_path, capsys, robot):
     run("import", tmp_path / "a.npz", "walk", "--out", tmp_path / "both")
     assert sorted(p.name for p in (tmp_path / "both").iterdir()) == ["a.npz", "walk.npz"]
     run("check", tmp_path / "both" / "walk.npz")
-    assert "broken" not in capsys.readouterr().out
+    run("import", "walk", "--speed", "1.4", "--out", tmp_path / "fast.npz")
+    said = capsys.readouterr().out
+    assert "broken" not in said
+    torque = re.search(r"torque +(\S+) of (\w+)'s limit, (\S+) of (\w+)'s at the file's speed", said)
+    fast, slow = (figures(robot, motion.load(path))["torque"] for path in (tmp_path / "fast.npz", "walk"))
+    assert torque.groups() == (f"{fast.value:.2f}", fast.where, f"{slow.value:.2f}", slow.where)
 
 
 def test_broken_clip_is_exit_code_one_until_it_is_fixed(tmp_path, capsys, walk):
@@ -377,6 +383,21 @@ def test_train_says_what_it_reads_and_warns_first(robot, walk, tmp_path, reset):
     assert "warning: penetration is broken: 0.2" in said
     assert ("warning: the motion heads 90° from +x" in said) == (reset == "fixed")
     assert "--set features.axes=heading" in said
+
+
+def test_of_many_motions_train_says_what_they_share(robot, walk, tmp_path):
+    """One line per value of a fact and one warning per kind, however many motions there are."""
+    runs = pytest.importorskip("fmpjax.runs")
+    for i in range(6):
+        part = dataclasses.replace(walk, qpos=walk.qpos[: 100 + 20 * i] - [0, 0, 0.2 * (i < 4), *np.zeros(33)])
+        motion.save(part, tmp_path / f"part{i}.npz")
+    names = library.listed(str(tmp_path))
+    said = runs.describe(configuration.preset("smoke", motion=names)).split("\n")
+    assert said[0] == "6 motions, 18 s in all, were read as"
+    assert sum(line.lstrip().startswith("format") for line in said) == 1 and "6 motions: its arrays" in said[1]
+    sunk = [line for line in said if "penetration is broken: 0.2" in line]
+    assert len(sunk) == 1 and sunk[0].endswith("[motion part0 and 3 more]")
+    assert len(said) < 16
 
 
 def test_train_prints_it(monkeypatch, capsys, tmp_path):

@@ -28,6 +28,7 @@ from fmpjax.robots import Robot
 
 RATE = 30.0  # Hz
 MOST_BYTES = 1 << 29
+AT_ONCE = 4096  # lines whose cells are Python's objects at the same time
 MOST_RATE = 1000.0  # Hz, that a name or a column of times is trusted to mean
 SEPARATORS = (";", "\t", ",")  # the first that the first line has; else spaces
 _PLACE = re.compile(r"(?:.*[^a-z])?(?:x|y|z)$|.*(?:translate|trans|pos|position)(?:x|y|z)$")
@@ -108,8 +109,7 @@ def _rows(
 ) -> np.ndarray:
     """The numbers ``[T, columns]``."""
     if separator is None:
-        split = [line.split() for line in lines]
-        counts = list(map(len, split))
+        counts = [len(line.split()) for line in lines]
     else:
         trailing = all(line.rstrip("\r ").endswith(separator) for line in lines)
         if trailing:
@@ -128,16 +128,18 @@ def _rows(
                 f"{file}: line {number} has {count} columns, expected {columns}"
                 f"{' as the header has' if named else f' (root xyz, quaternion xyzw, {columns - 7} joints)'}"
             )
-    cells = [cell for row in split for cell in row] if separator is None else separator.join(lines).split(separator)
-    try:
-        values = np.array(list(map(float, cells)))
-    except ValueError:
-        at = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-        raise UserError(
-            f"{file}: line {at // columns + 1 + first}, column {at % columns + 1} is {cells[at].strip()[:40]!r}, "
-            "expected a number"
-        ) from None
-    return values.reshape(-1, columns)
+    values = np.empty((len(lines), columns))
+    for start in range(0, len(lines), AT_ONCE):
+        cells = (separator or " ").join(lines[start : start + AT_ONCE]).split(separator)
+        try:
+            values[start : start + AT_ONCE] = np.array(list(map(float, cells))).reshape(-1, columns)
+        except ValueError:
+            at = next(i for i, cell in enumerate(cells) if not _is_number(cell))
+            raise UserError(
+                f"{file}: line {start + at // columns + 1 + first}, column {at % columns + 1} is "
+                f"{cells[at].strip()[:40]!r}, expected a number"
+            ) from None
+    return values
 
 
 def _layout(
