@@ -249,6 +249,19 @@ def test_a_long_motion_is_checked_in_pieces(robot, walk, monkeypatch):
     assert not any("duration" in fault for fault in pieces)
 
 
+def test_torques_of_a_long_motion_are_sampled(robot, walk, monkeypatch):
+    """Of an hour not every sample is measured; the figure stays what it is."""
+    whole = figures(robot, walk)["torque"]
+    monkeypatch.setattr(check, "MOST_TORQUES", 140)
+    points, _ = soles.sole_points(robot, walk.qpos)
+    height = points[..., 2] - robot.sole_radius
+    every = check.torques(robot, walk, points, height)
+    np.testing.assert_allclose(check.torques(robot, walk, points, height, 3), every[::3])
+    sampled = figures(robot, walk)["torque"]
+    assert sampled.value != whole.value
+    assert sampled.value == pytest.approx(whole.value, rel=0.15)
+
+
 def test_not_a_number_is_broken():
     assert check.Figure("speed", float("nan")).verdict == "broken"
 

@@ -6,6 +6,7 @@ rate is the one in the file's name ("60hz"), or 30 Hz, that of LaFAN1.
 """
 
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -130,9 +131,15 @@ def _rows(
             )
     values = np.empty((len(lines), columns))
     for start in range(0, len(lines), AT_ONCE):
-        cells = (separator or " ").join(lines[start : start + AT_ONCE]).split(separator)
+        part = values[start : start + AT_ONCE]
+        text = (separator or " ").join(lines[start : start + AT_ONCE])
+        numbers = _parsed(text, separator)
+        if numbers is not None and numbers.size == part.size:
+            part[:] = numbers.reshape(part.shape)
+            continue
+        cells = text.split(separator)
         try:
-            values[start : start + AT_ONCE] = np.array(list(map(float, cells))).reshape(-1, columns)
+            part[:] = np.array(list(map(float, cells))).reshape(part.shape)
         except ValueError:
             at = next(i for i, cell in enumerate(cells) if not _is_number(cell))
             raise UserError(
@@ -140,6 +147,16 @@ def _rows(
                 f"{cells[at].strip()[:40]!r}, expected a number"
             ) from None
     return values
+
+
+def _parsed(text: str, separator: str | None) -> np.ndarray | None:
+    """The numbers in a text by NumPy, which is quick and says nothing of what it can't read; None in that case."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            return np.fromstring(text, sep=separator or " ")
+        except (ValueError, DeprecationWarning):
+            return None
 
 
 def _layout(
