@@ -94,24 +94,33 @@ class Import(Reading):
         if several and len(set(paths)) < len(paths):
             raise UserError("two of the files have the same name: import them one by one")
         robot = robots.load(self.robot)
-        clips = []
+        clips, said = [], []
         for file in self.files:
             clip = motion.load(file, rate=self.rate, **self.options())
+            said.append(f"{file} was read as\n{clip.reading}")
             if self.speed != 1:
-                clip = edit.faster(clip, self.speed)
+                before, clip = clip, edit.faster(clip, self.speed)
+                said.append(f"  {_torques(robot, before, clip)}")
             if self.mirror:
                 clip = edit.mirrored(robot, clip)
             if self.heading is not None:
                 clip = edit.headed(clip, math.radians(self.heading))
             clip = edit.looped(clip) if self.loop else clip
             clips.append(edit.repeated(clip, self.repeat) if self.repeat > 1 else clip)
-        for file, clip in zip(self.files, clips, strict=True):
-            print(f"{file} was read as\n{clip.reading}")
+        print("\n".join(said))
         clips = [edit.joined(clips)] if self.join else clips
         for clip, path in zip(clips, paths, strict=not self.join):
             for warning in check.faults(robot, clip):
                 print(f"  warning: {warning}")
             print(f"wrote {motion.save(clip, path)}: {len(clip)} samples, {clip.duration:.2f} s at {clip.rate:g} Hz")
+
+
+def _torques(robot: robots.Robot, before: MotionClip, after: MotionClip) -> str:
+    """A line on what another speed asks of the motors."""
+    from fmpjax.motion import check
+
+    own, new = (next(f for f in check.check(robot, clip) if f.name == "torque") for clip in (before, after))
+    return f"torque      {new.value:.2f} of {new.where}'s limit, {own.value:.2f} of {own.where}'s at the file's speed"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -267,10 +276,10 @@ class Synthesize:
 
 @dataclasses.dataclass(frozen=True)
 class Retarget:
-    """Put a human's motion capture (BVH) on a robot by inverse kinematics; exit code 1 where the result is broken."""
+    """Put a human's motion capture (BVH, SMPL) on a robot by inverse kinematics; exit code 1 where that is broken."""
 
     file: tyro.conf.Positional[Path]
-    """Motion capture, .bvh."""
+    """Motion capture: .bvh, or .npz with SMPL's parameters as AMASS writes them."""
     out: Path
     """File to write, .npz."""
     frames: Annotated[str | None, default("all")] = None
@@ -281,13 +290,16 @@ class Retarget:
     """TOML file with the skeleton's joints of parts whose names are not known, as left_hip = "LThigh"."""
     up: Annotated[str | None, default("told by the file")] = None
     """The file's axis that is up, y or z; by default the one along which hips are over ankles."""
+    body_model: Annotated[Path | None, default("none")] = None
+    """The body model (.npz) that SMPL's parameters are for, from its makers."""
 
     def __call__(self) -> None:
         from fmpjax.motion import retarget
 
         said, broken = retarget.convert(
-            self.file, robots.load(self.robot), self.out, self.frames, skeleton=self.skeleton, up=self.up
-        )
+            self.file, robots.load(self.robot), self.out, self.frames,
+            skeleton=self.skeleton, up=self.up, body_model=self.body_model,
+        )  # fmt: skip
         print(said)
         if broken:
             sys.exit(1)

@@ -25,6 +25,7 @@ WINDOWS = 512  # windows at most on either side of the Sinkhorn discrepancy [D]
 CONTACT_HEIGHT = 0.01  # m, a foot is in contact where a sole point is lower [D]
 LEAST_SPEED = 0.1  # m/s, to which an error in speed is relative at least [D]
 OTHER_SIZES = 3  # times fewer episodes at the sizes of perturbation that are not the headline's [D]
+LISTED = 12  # motions that the table names
 STARTS_SEED = 1  # of the episodes' starts, the same in every evaluation [D]
 DISCREPANCY_THRESHOLD, DISCREPANCY_ITERATIONS = 1e-4, 2000  # marginal error (L1) of its solves; iterations at most [D]
 
@@ -346,6 +347,13 @@ def _finite_mean(ranges: np.ndarray) -> np.ndarray:
     return kept.mean(0) if len(kept) else np.full(ranges.shape[-1], np.nan)
 
 
+def _listed(motions: tuple[Share, ...]) -> list[Share]:
+    """The motions that a table shows: all of a few, of many those with the most falls."""
+    if len(motions) <= LISTED:
+        return list(motions)
+    return sorted(motions, key=lambda share: -share.falls)[:LISTED]
+
+
 def table(evaluation: Evaluation) -> str:
     """The figures as a table for people."""
     e = evaluation
@@ -375,6 +383,8 @@ def table(evaluation: Evaluation) -> str:
             f"{share.late_speed:.3f}",
             f"m/s of {share.demonstration_speed:.3f}, {share.falls} falls in {share.episodes}",
         )
-        for share in e.motions
+        for share in _listed(e.motions)
     ]
+    if len(e.motions) > LISTED:
+        rows.append((f"and {len(e.motions) - LISTED} more motions", "", "with fewer falls or as many"))
     return tables.lines("  {:<36} {:>20}  {}", rows)

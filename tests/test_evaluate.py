@@ -1,5 +1,6 @@
 """Evaluations from perturbed starts, on a physics of a line: who starts too far off its pose lies down at once."""
 
+import dataclasses
 import json
 from types import SimpleNamespace
 
@@ -62,6 +63,11 @@ def test_falls_from_the_fixed_pose_at_every_size_of_noise(fixed, evaluator):
     # Columns are named before anything is played.
     assert set(result.as_dict()) == set(evaluate.names(fixed.config))
     assert {"falls_at_0", "episodes_at_0.001", "falls_at_0.01"} <= set(result.as_dict())
+    # Of many motions the table names those with the most falls.
+    shares = tuple(evaluate.Share(f"clip{i}", 2, i % 2, 1.0, 2, 1.0) for i in range(30))
+    shown = evaluate.table(dataclasses.replace(result, motions=shares))
+    assert shown.count("from clip") == evaluate.LISTED and "from clip0 " not in shown and "from clip1 " in shown
+    assert "and 18 more motions" in shown
     found = strict(result.to_json())
     assert found["starts"][1] == {"noise": 0.001, "episodes": 40, "falls": 0} and found["noise"] == 0.001
     # Another policy starts from the same states, in the same program.

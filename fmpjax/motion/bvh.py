@@ -8,7 +8,7 @@ that the ones before have turned. A position channel replaces the offset's compo
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from fmpjax import rotations
 from fmpjax.errors import UserError
+from fmpjax.motion.skeleton import JointPoses, posed
 
 CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
 MOST_BYTES = 1 << 27
@@ -35,13 +36,29 @@ class Bvh(NamedTuple):
     channels: tuple[tuple[int, ...], ...]  # [J] indices into `CHANNELS`, in the file's order; none at an End Site
     rate: float  # Hz
     values: np.ndarray  # [T, C] channels of all joints in turn, lengths and deg
+    format: str = "BVH"
 
+    def taken(self, values: np.ndarray) -> "Bvh":
+        """The same skeleton with other frames ``[T, C]``."""
+        return self._replace(values=values)
 
-class JointPoses(NamedTuple):
-    """World poses of the joints, in the file's axes and unit of length."""
+    def poses(self, joints: Sequence[int] | None = None) -> JointPoses:
+        """Where the ``joints``, by default all, are in every frame."""
+        first = np.cumsum([0, *map(len, self.channels)])
 
-    position: np.ndarray  # [T, J, 3]
-    rotation_wxyz: np.ndarray  # [T, J, 4]
+        def local(joint: int) -> tuple[np.ndarray, np.ndarray]:
+            moved = np.tile(self.offset[joint], (len(self.values), 1))
+            turned_wxyz = np.tile([1.0, 0.0, 0.0, 0.0], (len(self.values), 1))
+            for column, channel in enumerate(self.channels[joint], first[joint]):
+                value = self.values[:, column]
+                if channel < 3:
+                    moved[:, channel] = value
+                else:
+                    about = np.radians(value)[:, None] * np.eye(3)[channel - 3]
+                    turned_wxyz = rotations.multiply(turned_wxyz, rotations.exp_map(about))
+            return moved, turned_wxyz
+
+        return posed(self.parent, local, joints)
 
 
 def read(path: str | os.PathLike) -> Bvh:
@@ -76,30 +93,6 @@ def read(path: str | os.PathLike) -> Bvh:
             f"expected at most {MOST_POSES}"
         )
     return Bvh(names, parent, offset, channels, rate, values)
-
-
-def joint_poses(bvh: Bvh) -> JointPoses:
-    """Where the joints are in every frame."""
-    frames, joints = len(bvh.values), len(bvh.names)
-    position, rotation_wxyz = np.empty((frames, joints, 3)), np.empty((frames, joints, 4))
-    column = 0
-    for joint, parent in enumerate(bvh.parent):
-        moved = np.tile(bvh.offset[joint], (frames, 1))
-        turned_wxyz = np.tile([1.0, 0.0, 0.0, 0.0], (frames, 1))
-        for channel in bvh.channels[joint]:
-            value = bvh.values[:, column]
-            column += 1
-            if channel < 3:
-                moved[:, channel] = value
-            else:
-                about = np.radians(value)[:, None] * np.eye(3)[channel - 3]
-                turned_wxyz = rotations.multiply(turned_wxyz, rotations.exp_map(about))
-        if parent >= 0:
-            above_wxyz = rotation_wxyz[:, parent]
-            moved = position[:, parent] + rotations.rotate(above_wxyz, moved)
-            turned_wxyz = rotations.multiply(above_wxyz, turned_wxyz)
-        position[:, joint], rotation_wxyz[:, joint] = moved, turned_wxyz
-    return JointPoses(position, rotation_wxyz)
 
 
 def _hierarchy(file: Path, lines: list[str]) -> tuple[tuple, np.ndarray, np.ndarray, tuple]:

@@ -18,6 +18,7 @@ CONTACT = 0.01  # m, a sole point below this height counts as standing
 BEARING = 0.03  # m, a sole point at this height bears nothing, one on the floor its share
 DAMPING = 1e-3  # keeps forces finite where few points are near the floor
 PIECE, LEAST_PIECE = 5000, 10  # samples that are checked at once, for memory, and that are worth it
+MOST_TORQUES = 20_000  # samples of a clip whose torques are measured, for time
 MOST_PACE = 60.0  # s in which strides are looked for
 WAY = 0.5  # m; a root that ends nearer to its start has no way
 TURNED, HEADED = np.radians(45), np.radians(20)  # from where a motion turns, or heads off +x
@@ -75,8 +76,8 @@ class Figure(NamedTuple):
         return "good" if span.low <= self.value <= span.high else "odd"
 
 
-def check(robot: Robot, clip: MotionClip, flips: int = 0, start: float = 0.0) -> list[Figure]:
-    """The figures of a clip that begins at ``start`` s, in the order of `RANGES`.
+def check(robot: Robot, clip: MotionClip, flips: int = 0) -> list[Figure]:
+    """The figures of a clip of any length, in the order of `RANGES`; a long one is measured in pieces, for memory.
 
     ``duration``; ``speed``, the root's mean over the floor; ``limit excess`` of a joint beyond its limit; greatest
     ``joint speed`` and, from second differences, ``joint acceleration``, ``root acceleration``; ``root turn``, its
@@ -86,7 +87,42 @@ def check(robot: Robot, clip: MotionClip, flips: int = 0, start: float = 0.0) ->
     the floor of sole points below `CONTACT`; ``penetration``, greatest; ``float``, the height of the lowest sole point
     that is undercut a tenth of the time; ``torque``, the greatest share of a motor's limit, exceeded 1 % of the time;
     ``loop gap``, the greatest angle between the last pose and the first.
+
+    ``foot slip``, ``float`` and ``torque`` are those of the worst piece of `PIECE` samples. Of more than `MOST_TORQUES`
+    samples, torques are measured at every second, third, ... one.
     """
+    found, every = _whole(clip, flips), -(-len(clip) // MOST_TORQUES)
+    for first in range(0, max(1, len(clip) - 1), PIECE - 1):
+        rows = slice(first, first + PIECE)
+        piece = clip if len(clip) <= PIECE else dataclasses.replace(clip, qpos=clip.qpos[rows], qvel=clip.qvel[rows])
+        if len(piece) < LEAST_PIECE < len(clip):
+            continue
+        for figure in _measured(robot, piece, first / clip.rate, every):
+            known = found.setdefault(figure.name, figure)
+            if not figure.value <= known.value:  # more, or not a number
+                found[figure.name] = figure
+    return [found[name] for name in RANGES]
+
+
+def _whole(clip: MotionClip, flips: int) -> dict[str, Figure]:
+    """Figures that only the whole clip has, by name."""
+    target, last = loop_target(clip), clip.qpos[-1]
+    gap = np.linalg.norm(rotations.log_map(rotations.multiply(rotations.conjugate(last[3:7]), target[3:7])))
+    facing = float(np.degrees(rotations.yaw(np.asarray(clip.qpos[0, 3:7]))))
+    figures = (
+        Figure("duration", clip.duration),
+        Figure("speed", float(np.linalg.norm(np.diff(clip.qpos[:, :2], axis=0), axis=1).mean() * clip.rate)),
+        Figure("tilt", float(np.degrees(np.median(np.arccos(np.clip(rotations.up(clip.qpos[:, 3:7]), -1, 1)))))),
+        Figure("heading", float(np.degrees(heading(clip))), f"faces {facing:.0f}°"),
+        Figure("turning", turning(clip), f"{np.degrees(spread(clip)):.0f}° at most from the first heading"),
+        Figure("flips", flips, "taken out on reading" if flips else ""),
+        Figure("loop gap", float(max(gap, np.abs(last[7:] - target[7:]).max()))),
+    )
+    return {figure.name: figure for figure in figures}
+
+
+def _measured(robot: Robot, clip: MotionClip, start: float, every: int) -> list[Figure]:
+    """The other figures of a piece that begins at ``start`` s, torques at every ``every``-th sample."""
     joints, rate = clip.qpos[:, 7:], clip.rate
     names, times = robot.joint_names, start + np.arange(len(clip)) / rate
     points, rotation = sole_points(robot, clip.qpos)
@@ -94,12 +130,8 @@ def check(robot: Robot, clip: MotionClip, flips: int = 0, start: float = 0.0) ->
     lowest = height.min(axis=1)
     standing = (height[1:] < CONTACT) & (height[:-1] < CONTACT)
     slide = slides(robot, points, rotation)[standing] * rate
-    share = torques(robot, clip, points, height) / robot.effort
+    share = torques(robot, clip, points, height, every) / robot.effort
     greatest = np.percentile(share.max(axis=1), 99)
-    target, last = loop_target(clip), clip.qpos[-1]
-    tilt = np.linalg.norm(rotations.log_map(rotations.multiply(rotations.conjugate(last[3:7]), target[3:7])))
-
-    facing = float(np.degrees(rotations.yaw(np.asarray(clip.qpos[0, 3:7]))))
 
     def worst(name: str, values: np.ndarray, first: int = 0) -> Figure:
         row, column = np.unravel_index(np.argmax(values), values.shape)
@@ -109,22 +141,15 @@ def check(robot: Robot, clip: MotionClip, flips: int = 0, start: float = 0.0) ->
     excess = np.maximum(0, np.maximum(robot.joint_low - joints, joints - robot.joint_high))
     limit = worst("limit excess", excess)
     return [
-        Figure("duration", clip.duration),
-        Figure("speed", float(np.linalg.norm(np.diff(clip.qpos[:, :2], axis=0), axis=1).mean() * rate)),
         limit if limit.value else Figure("limit excess", 0.0),
         worst("joint speed", np.abs(np.diff(joints, axis=0)) * rate),
         worst("joint acceleration", np.abs(np.diff(joints, 2, axis=0)) * rate**2, 1),
         worst("root acceleration", np.linalg.norm(np.diff(clip.qpos[:, :3], 2, axis=0), axis=1)[:, None] * rate**2, 1),
         worst("root turn", np.linalg.norm(clip.qvel[:, 3:6], axis=1)[:, None]),
-        Figure("tilt", float(np.degrees(np.median(np.arccos(np.clip(rotations.up(clip.qpos[:, 3:7]), -1, 1)))))),
-        Figure("heading", float(np.degrees(heading(clip))), f"faces {facing:.0f}°"),
-        Figure("turning", turning(clip), f"{np.degrees(spread(clip)):.0f}° at most from the first heading"),
-        Figure("flips", flips, "taken out on reading" if flips else ""),
         Figure("foot slip", float(slide.mean()) if len(slide) else 0.0, "" if len(slide) else "nothing stands"),
         worst("penetration", np.maximum(0.0, -lowest)[:, None]),
         Figure("float", float(max(0.0, np.percentile(lowest, 10)))),
         Figure("torque", float(greatest), names[int(np.argmax(np.percentile(share, 99, axis=0)))]),
-        Figure("loop gap", float(max(tilt, np.abs(last[7:] - target[7:]).max()))),
     ]
 
 
@@ -211,19 +236,8 @@ def pace(robot: Robot, clip: MotionClip) -> tuple[float, float]:
 
 
 def faults(robot: Robot, clip: MotionClip) -> list[str]:
-    """A sentence per figure that is not good, broken ones first; a long clip is checked in pieces."""
-    worst: dict[str, Figure] = {}
-    for first in range(0, max(1, len(clip) - 1), PIECE - 1):
-        rows = slice(first, first + PIECE)
-        piece = clip if len(clip) <= PIECE else dataclasses.replace(clip, qpos=clip.qpos[rows], qvel=clip.qvel[rows])
-        if len(piece) < LEAST_PIECE < len(clip):
-            continue
-        for figure in check(robot, piece, start=first / clip.rate):
-            known = worst.setdefault(figure.name, figure)
-            if (_VERDICTS.index(figure.verdict), figure.value) > (_VERDICTS.index(known.verdict), known.value):
-                worst[figure.name] = figure
-    worst["duration"] = Figure("duration", clip.duration)
-    figures = sorted(worst.values(), key=lambda figure: -_VERDICTS.index(figure.verdict))
+    """A sentence per figure that is not good, broken ones first."""
+    figures = sorted(check(robot, clip), key=lambda figure: -_VERDICTS.index(figure.verdict))
     return [
         f"{f.name} is {f.verdict}: {_value(f)}, healthy {_healthy(f)}{f' ({f.where})' if f.where else ''}"
         for f in figures
@@ -236,8 +250,8 @@ def flips(q_wxyz: np.ndarray) -> int:
     return int(np.count_nonzero(np.sum(q_wxyz[1:] * q_wxyz[:-1], axis=1) < 0))
 
 
-def torques(robot: Robot, clip: MotionClip, points: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Motor torques that the motion asks for, magnitudes ``[T, J]`` N m.
+def torques(robot: Robot, clip: MotionClip, points: np.ndarray, height: np.ndarray, every: int = 1) -> np.ndarray:
+    """Motor torques that the motion asks for at every ``every``-th sample, magnitudes ``[S, J]`` N m.
 
     Inverse dynamics gives the wrench that must act on the root, and torques as if it did. The floor gives that wrench
     instead: the least forces at sole points near the floor (``points [T, P, 3]``, ``height [T, P]`` m) that sum to it,
@@ -248,19 +262,26 @@ def torques(robot: Robot, clip: MotionClip, points: np.ndarray, height: np.ndarr
     model, data = copy.copy(robot.model), mujoco.MjData(robot.model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     window = min(2 * max(2, round(SMOOTHING * clip.rate)) + 1, len(clip) - 1 + len(clip) % 2)
-    speed = savgol_filter(clip.qvel, window, 2, axis=0)
-    acceleration = savgol_filter(clip.qvel, window, 2, deriv=1, delta=1 / clip.rate, axis=0)
-    bottom = points - [0.0, 0.0, 1.0] * robot.sole_radius[:, None]
-    needed = np.zeros((len(clip), model.nv))
-    jacobian = np.zeros((len(clip), points.shape[1], 3, model.nv))
-    for i in range(len(clip)):
-        data.qpos[:], data.qvel[:], data.qacc[:] = clip.qpos[i], speed[i], acceleration[i]
+    speed = savgol_filter(clip.qvel, window, 2, axis=0)[::every]
+    acceleration = savgol_filter(clip.qvel, window, 2, deriv=1, delta=1 / clip.rate, axis=0)[::every]
+    qpos, height = clip.qpos[::every], height[::every]
+    bottom = points[::every] - [0.0, 0.0, 1.0] * robot.sole_radius[:, None]
+    needed = np.zeros((len(qpos), model.nv))
+    bodies, which = np.unique(robot.sole_body + 1, return_inverse=True)
+    place = np.zeros((len(qpos), len(bodies), 3))
+    moves, turns = (np.zeros((len(qpos), len(bodies), 3, model.nv)) for _ in range(2))
+    for i in range(len(qpos)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = qpos[i], speed[i], acceleration[i]
         mujoco.mj_inverse(model, data)
         needed[i] = data.qfrc_inverse
-        for p, body in enumerate(robot.sole_body):
-            mujoco.mj_jac(model, data, jacobian[i, p], None, bottom[i, p], body + 1)
+        place[i] = data.xpos[bodies]
+        for b, body in enumerate(bodies):
+            mujoco.mj_jacBody(model, data, moves[i, b], turns[i, b], body)
+    # A point moves with its body and by the body's turn crossed with where it is from the body.
+    arm = (bottom - place[:, which])[..., None]
+    jacobian = moves[:, which] + np.cross(turns[:, which], arm, axis=2)
     weight = np.repeat(np.clip(1 - height / BEARING, 0, 1), 3, axis=1)[:, :, None]
-    jacobian = jacobian.reshape(len(clip), -1, model.nv)
+    jacobian = jacobian.reshape(len(qpos), -1, model.nv)
     root = jacobian[:, :, :6]
     gram = np.swapaxes(root, 1, 2) @ (weight * root) + DAMPING * np.eye(6)
     force = weight * (root @ np.linalg.solve(gram, needed[:, :6, None]))

@@ -1,6 +1,7 @@
 """Several demonstrations as one: which there are, and how often each is drawn."""
 
 import dataclasses
+import glob
 import math
 import os
 from functools import cached_property
@@ -13,7 +14,7 @@ from fmpjax.errors import UserError
 from fmpjax.motion.clip import MotionClip
 from fmpjax.motion.formats import load
 
-SUFFIXES = (".npz", ".npy", ".csv", ".txt", ".json", ".pkl", ".pt")  # of the files of a folder that are motions
+SUFFIXES = (".npz", ".csv", ".txt", ".pkl", ".pt", ".motion")  # of the files of a folder that are motions
 NAMED = 4  # motions at most of which a line shows the names
 
 
@@ -53,18 +54,25 @@ class MotionLibrary:
         """First row of each clip, ``[K]``."""
         return np.cumsum(self.lengths) - self.lengths
 
-    def rows_after(self, before: int) -> np.ndarray:
-        """Rows with at least ``before`` rows of their own clip ahead of them, ``[W]``."""
+    def rows_after(self, before: int, most: int | None = None) -> np.ndarray:
+        """Rows with at least ``before`` rows of their own clip ahead of them, ``[W]``.
+
+        Where they are more than ``most``, every second, third, ... row of each clip, so that about as many are left.
+        """
+        every = self._every(before, most)
         return np.concatenate(
-            [np.arange(start + before, start + n) for start, n in zip(self.starts, self.lengths, strict=True)]
+            [np.arange(start + before, start + n, every) for start, n in zip(self.starts, self.lengths, strict=True)]
         )
 
-    def share_after(self, before: int) -> np.ndarray | None:
+    def share_after(self, before: int, most: int | None = None) -> np.ndarray | None:
         """How often each of those rows is drawn, ``[W]``, summing to one; None for one clip, where all are alike."""
         if len(self.clips) == 1:
             return None
-        rows = self.lengths - before
+        rows = -(-(self.lengths - before) // self._every(before, most))
         return np.repeat(np.array(self.weights) / rows, rows)
+
+    def _every(self, before: int, most: int | None) -> int:
+        return 1 if most is None else max(1, math.ceil(int((self.lengths - before).sum()) / most))
 
     def clip_of(self, rows: np.ndarray) -> np.ndarray:
         """Index of the clip of each row; that of the last clip for rows past the end."""
@@ -108,28 +116,27 @@ def title(name: str) -> str:
 
 
 def listed(names: str) -> str:
-    """A list of motions in which each folder, one's own or a shipped one, is replaced by the motion files in it.
+    """A list of motions in which folders and patterns are replaced by the motion files that they stand for.
 
-    A folder's weight is shared evenly by its files.
+    A folder is one's own or a shipped one; a pattern has a ``*``, ``?`` or ``[]``, ``**`` for folders in folders. Its
+    files share its weight evenly.
 
     Raises:
-      UserError: a folder holds no motion files, or `parse` refuses the list.
+      UserError: a folder holds no motion files, no file fits a pattern, a file's name has a comma, or `parse` refuses
+        the list.
     """
     if os.path.isfile(names):
         return names
     entries = []
     for name, weight in parse(names):
-        shipped = resources.folder("motions") / name
-        folder = next((path for path in (Path(name), shipped) if path.is_dir()), None)
-        names_shipped = folder == shipped and not Path(name).is_absolute()
-        if folder is None:
+        files = _files(name)
+        if files is None:
             entries.append(name if weight == 1 else f"{name}:{weight:g}")
             continue
-        files = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
-        if not files:
-            raise UserError(f"folder {folder} holds no motion files: expected some that end in {', '.join(SUFFIXES)}")
-        parts = [f"{name}/{path.stem}" if names_shipped else str(path) for path in files]
-        entries += [f"{part}:{weight / len(files):.6g}" for part in parts]
+        for file in files:
+            if "," in file:
+                raise UserError(f"motion file {file} has a comma in its name, which parts motions: expected none")
+        entries += [f"{file}:{weight / len(files):.6g}" for file in files]
     return ",".join(entries)
 
 
@@ -139,6 +146,25 @@ def briefly(names: str) -> str:
     if len(entries) <= NAMED:
         return f"motion {names}"
     return f"{len(entries)} motions: {', '.join(name for name, _ in entries[:NAMED])} and {len(entries) - NAMED} more"
+
+
+def _files(name: str) -> list[str] | None:
+    """The motion files that a folder or a pattern stands for; None for the name of one motion."""
+    shipped = resources.folder("motions") / name
+    folder = next((path for path in (Path(name), shipped) if path.is_dir()), None)
+    if folder is not None:
+        found = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
+        if not found:
+            raise UserError(f"folder {folder} holds no motion files: expected some that end in {', '.join(SUFFIXES)}")
+        if folder == shipped and not Path(name).is_absolute():
+            return [f"{name}/{path.stem}" for path in found]
+        return list(map(str, found))
+    if os.path.isfile(name) or not any(sign in name for sign in "*?["):
+        return None
+    matches = sorted(path for path in glob.glob(name, recursive=True) if os.path.isfile(path))
+    if not matches:
+        raise UserError(f"no file fits the pattern {name!r}: expected motion files, such as 'clips/*.npz'")
+    return matches
 
 
 def describe(name: str) -> str:

@@ -1,22 +1,34 @@
 """Where the soles of a clip are, and how far they slide over the floor."""
 
-import mujoco
 import numpy as np
 
+from fmpjax import rotations
+from fmpjax.motion.skeleton import posed
 from fmpjax.robots import Robot
 
 
 def sole_points(robot: Robot, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World centres of the sole spheres ``[T, P, 3]`` and rotation matrices of their bodies ``[T, P, 3, 3]``."""
-    data = mujoco.MjData(robot.model)
-    position = np.zeros((len(qpos), len(robot.sole_body), 3))
-    rotation = np.zeros((*position.shape, 3))
-    for i, row in enumerate(qpos):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(robot.model, data)
-        rotation[i] = data.xmat[robot.sole_body + 1].reshape(-1, 3, 3)
-        position[i] = data.xpos[robot.sole_body + 1]
-    return position + np.einsum("tpij,pj->tpi", rotation, robot.sole_point), rotation
+    """World centres of the sole spheres ``[T, P, 3]`` and rotation matrices of their bodies ``[T, P, 3, 3]``.
+
+    All samples at once, which takes a tenth of the time of MuJoCo's kinematics sample by sample.
+    """
+
+    def local(body: int) -> tuple[np.ndarray, np.ndarray]:
+        if body == 0:
+            return qpos[:, :3], qpos[:, 3:7] / np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+        place = np.broadcast_to(robot.body_position[body], (len(qpos), 3))
+        joint, rest_wxyz = robot.body_joint[body], robot.body_rotation_wxyz[body]
+        if joint < 0:
+            return place, np.broadcast_to(rest_wxyz, (len(qpos), 4))
+        half = qpos[:, 7 + joint, None] / 2
+        turned_wxyz = rotations.multiply(rest_wxyz, np.concatenate([[0.0], robot.joint_axis[joint]]))
+        return place, np.cos(half) * rest_wxyz + np.sin(half) * turned_wxyz
+
+    bodies, which = np.unique(robot.sole_body, return_inverse=True)
+    position, rotation_wxyz = posed(robot.body_parent, local, bodies.tolist())
+    axes = rotations.rotate(rotation_wxyz[:, :, None], np.broadcast_to(np.eye(3), (*position.shape, 3)))
+    rotation = np.swapaxes(axes, -1, -2)[:, which]
+    return position[:, which] + np.einsum("tpij,pj->tpi", rotation, robot.sole_point), rotation
 
 
 def slides(robot: Robot, points: np.ndarray, rotation: np.ndarray) -> np.ndarray:

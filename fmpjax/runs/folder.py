@@ -15,7 +15,7 @@ from fmpjax.config import Config
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Evaluation, Evaluator
 from fmpjax.files import write
-from fmpjax.motion import check
+from fmpjax.motion.summary import summary
 from fmpjax.provenance import provenance
 from fmpjax.trainer import Trainer, TrainState
 
@@ -50,18 +50,13 @@ def load_motion(config: Config) -> motion.MotionLibrary:
 
 def describe(config: Config) -> str:
     """What the motions of a configuration were read as, and whether they are fit to learn from with its settings."""
-    robot, lines = robots.load(config.robot), []
-    for clip in load_motion(config).clips:
-        lines.append(f"motion {clip.name}, {len(clip)} samples in {clip.duration:.2f} s, was read as\n{clip.reading}")
-        said = check.faults(robot, clip) + check.unsuited(
-            robot,
-            clip,
-            axes=config.features.axes,
-            reset=config.env.reset,
-            seconds=config.env.episode_steps / config.control_rate,
-        )
-        lines += [f"  warning: {sentence}" for sentence in said]
-    return "\n".join(lines)
+    return summary(
+        robots.load(config.robot),
+        load_motion(config),
+        axes=config.features.axes,
+        reset=config.env.reset,
+        seconds=config.env.episode_steps / config.control_rate,
+    )
 
 
 class Run:

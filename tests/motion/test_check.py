@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import time
 
 import mujoco
@@ -12,7 +13,7 @@ from PIL import Image
 from fmpjax import cli, motion, robots, rotations
 from fmpjax import config as configuration
 from fmpjax.errors import UserError
-from fmpjax.motion import MotionClip, check, edit, segment, soles
+from fmpjax.motion import MotionClip, check, edit, library, segment, soles
 from fmpjax.viz import clip as show
 
 
@@ -248,6 +249,20 @@ def test_a_long_motion_is_checked_in_pieces(robot, walk, monkeypatch):
     assert not any("duration" in fault for fault in pieces)
 
 
+def test_torques_of_a_long_motion_are_sampled(robot, monkeypatch):
+    """Of an hour not every sample is measured; the figure stays what it is."""
+    turn = motion.load("turn_left")
+    whole = figures(robot, turn)["torque"].value
+    points, _ = soles.sole_points(robot, turn.qpos)
+    height = points[..., 2] - robot.sole_radius
+    every = check.torques(robot, turn, points, height)
+    np.testing.assert_allclose(check.torques(robot, turn, points, height, 2), every[::2])
+    monkeypatch.setattr(check, "MOST_TORQUES", 210)
+    sampled = figures(robot, turn)["torque"].value
+    assert abs(sampled - whole) > 1e-6
+    assert sampled == pytest.approx(whole, rel=0.05)
+
+
 def test_not_a_number_is_broken():
     assert check.Figure("speed", float("nan")).verdict == "broken"
 
@@ -312,7 +327,12 @@ def test_import_check_and_synthesize(tmp_path, capsys, robot):
     run("import", tmp_path / "a.npz", "walk", "--out", tmp_path / "both")
     assert sorted(p.name for p in (tmp_path / "both").iterdir()) == ["a.npz", "walk.npz"]
     run("check", tmp_path / "both" / "walk.npz")
-    assert "broken" not in capsys.readouterr().out
+    run("import", "walk", "--speed", "1.4", "--out", tmp_path / "fast.npz")
+    said = capsys.readouterr().out
+    assert "broken" not in said
+    torque = re.search(r"torque +(\S+) of (\w+)'s limit, (\S+) of (\w+)'s at the file's speed", said)
+    fast, slow = (figures(robot, motion.load(path))["torque"] for path in (tmp_path / "fast.npz", "walk"))
+    assert torque.groups() == (f"{fast.value:.2f}", fast.where, f"{slow.value:.2f}", slow.where)
 
 
 def test_broken_clip_is_exit_code_one_until_it_is_fixed(tmp_path, capsys, walk):
@@ -379,6 +399,21 @@ def test_train_says_what_it_reads_and_warns_first(robot, walk, tmp_path, reset):
     assert "--set features.axes=heading" in said
 
 
+def test_of_many_motions_train_says_what_they_share(robot, walk, tmp_path):
+    """One line per value of a fact and one warning per kind, however many motions there are."""
+    runs = pytest.importorskip("fmpjax.runs")
+    for i in range(6):
+        part = dataclasses.replace(walk, qpos=walk.qpos[: 100 + 20 * i] - [0, 0, 0.2 * (i < 4), *np.zeros(33)])
+        motion.save(part, tmp_path / f"part{i}.npz")
+    names = library.listed(str(tmp_path))
+    said = runs.describe(configuration.preset("smoke", motion=names)).split("\n")
+    assert said[0] == "6 motions, 18 s in all, were read as"
+    assert sum(line.lstrip().startswith("format") for line in said) == 1 and "6 motions: its arrays" in said[1]
+    sunk = [line for line in said if "penetration is broken: 0.2" in line]
+    assert len(sunk) == 1 and sunk[0].endswith("[motion part0 and 3 more]")
+    assert len(said) < 16
+
+
 def test_train_prints_it(monkeypatch, capsys, tmp_path):
     runs = pytest.importorskip("fmpjax.runs")
 
@@ -392,6 +427,21 @@ def test_train_prints_it(monkeypatch, capsys, tmp_path):
     with pytest.raises(Made):
         cli.main(["train", "--preset", "smoke", "--motion", "turn_right", "--run", str(tmp_path / "run")])
     assert "motion turn_right, " in capsys.readouterr().out
+
+
+def test_soles_are_where_mujoco_puts_them(robot):
+    rng = np.random.default_rng(0)
+    qpos = rng.normal(size=(20, 7 + robot.joint_count))
+    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    points, rotation = soles.sole_points(robot, qpos)
+    data = mujoco.MjData(robot.model)
+    for row, point, turned in zip(qpos, points, rotation, strict=True):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(robot.model, data)
+        own = data.xmat[robot.sole_body + 1].reshape(-1, 3, 3)
+        np.testing.assert_allclose(turned, own, atol=1e-12)
+        place = data.xpos[robot.sole_body + 1] + np.einsum("pij,pj->pi", own, robot.sole_point)
+        np.testing.assert_allclose(point, place, atol=1e-12)
 
 
 # --- stretches -------------------------------------------------------------------------------------------------------

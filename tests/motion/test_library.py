@@ -61,6 +61,24 @@ def test_a_file_with_commas_and_colons_in_its_name_is_a_file(tmp_path, monkeypat
     assert library.parse("walk,take:2") == [("walk", 1.0), ("take:2", 1.0)]
 
 
+def test_folders_and_patterns_are_their_files(tmp_path):
+    source = Path(motion.formats.locate("walk"))
+    for name in ("b.npz", "a.npz", "in/c.npz", "in/d.motion"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(source, tmp_path / name)
+    (tmp_path / "notes.md").write_text("mine")
+    a, b, c, d = (f"{tmp_path}/{name}" for name in ("a.npz", "b.npz", "in/c.npz", "in/d.motion"))
+    assert library.listed(f"{tmp_path}/in") == f"{c}:0.5,{d}:0.5"
+    assert library.listed(f"{tmp_path}/*.npz:3,walk") == f"{a}:1.5,{b}:1.5,walk"
+    assert library.listed(f"{tmp_path}/[ab].npz") == f"{a}:0.5,{b}:0.5"
+    assert len(library.parse(library.listed(f"{tmp_path}/**/*.npz"))) == 3
+    with pytest.raises(UserError, match=r"no file fits the pattern '.*/x\*': expected motion files"):
+        library.listed(f"{tmp_path}/x*")
+    shutil.copy(source, tmp_path / "in" / "c,d.npz")
+    with pytest.raises(UserError, match="c,d.npz has a comma in its name"):
+        library.listed(f"{tmp_path}/in")
+
+
 @pytest.mark.parametrize(
     ("names", "sentence"),
     [
@@ -111,6 +129,20 @@ def test_a_clip_has_its_weight_however_long_it_is(two):
     np.testing.assert_allclose([share[:21].sum(), share[21:].sum()], SHARES)
     np.testing.assert_allclose(share[:21], 0.8 / 21)
     assert MotionLibrary.of(two.clips[0]).share_after(HORIZON - 1) is None
+
+
+def test_of_many_windows_an_even_part_stands_for_all(two, env, monkeypatch):
+    """Memory does not grow with the demonstrations; every clip keeps its weight."""
+    monkeypatch.setattr("fmpjax.env.MOST_WINDOWS", 80)
+    whole = two.rows_after(HORIZON - 1)
+    rows, share = two.rows_after(HORIZON - 1, 80), two.share_after(HORIZON - 1, 80)
+    assert rows.tolist() == [*range(9, 30, 3), *range(39, 230, 3)] and len(whole) == 212
+    np.testing.assert_allclose([share[:7].sum(), share[7:].sum()], SHARES)
+    assert two.rows_after(HORIZON - 1, 212).tolist() == whole.tolist()
+    assert env.clip_windows().shape[0] == len(rows) == len(env.window_share())
+    np.testing.assert_array_equal(
+        env.clip_windows()[5], np.asarray(env._table.frame)[env.history_rows(jnp.array([24]))[0]]
+    )
 
 
 def test_episodes_start_in_the_clips_by_weight(two, env):

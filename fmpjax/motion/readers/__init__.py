@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from fmpjax.errors import UserError
-from fmpjax.motion.readers import archive, bodies, gmr, humanoidverse, locomujoco, mimickit, own, pickled, text
+from fmpjax.motion.readers import archive, bodies, gmr, humanoidverse, locomujoco, mimickit, own, pickled, smpl, text
 from fmpjax.motion.readers.recording import Options, Recording
 from fmpjax.robots import Robot
 
@@ -27,16 +27,27 @@ def read(file: Path, robot: Robot, options: Options) -> Recording:
             head = stream.read(9)
     except OSError as error:
         raise UserError(f"cannot read {file}: {error.strerror or error}") from error
-    if head[:2] == b"PK":
-        arrays = archive.Arrays(file)
-        if any(name.endswith("/data.pkl") for name in arrays.members):
-            return _known(file, pickled.read_torch(file, arrays.members), robot, options)
-        return _known(file, arrays, robot, options)
-    if head[:1] in (b"\x80", b"(", b"}") or head[:2] in pickled.COMPRESSED:
-        return _known(file, _single(file, pickled.read(file)), robot, options)
+    content = arrays(file, head)
+    if content is not None:
+        return _known(file, content, robot, options)
     if head == b"HIERARCHY":
         raise UserError(f"{file}: a BVH skeleton, which `fmpjax motion retarget` puts on a robot first")
     return text.read(file, robot, options)
+
+
+def arrays(file: Path, head: bytes) -> Mapping | None:
+    """The arrays by name in an archive or a pickle, which ``head``, the file's first bytes, tell; None for others.
+
+    Raises:
+      UserError: the file is damaged, or holds something else.
+    """
+    if head[:2] == b"PK":
+        found = archive.Arrays(file)
+        torch = any(name.endswith("/data.pkl") for name in found.members)
+        return pickled.read_torch(file, found.members) if torch else found
+    if head[:1] in (b"\x80", b"(", b"}") or head[:2] in pickled.COMPRESSED:
+        return _single(file, pickled.read(file))
+    return None
 
 
 def _single(file: Path, content: dict) -> dict:
@@ -52,6 +63,8 @@ def _single(file: Path, content: dict) -> dict:
 
 def _known(file: Path, content: Mapping, robot: Robot, options: Options) -> Recording:
     """The recording by the first format that knows the names in ``content``."""
+    if smpl.holds(content):
+        raise UserError(f"{file}: SMPL parameters of a human, which `fmpjax motion retarget` puts on a robot first")
     for format_ in FORMATS:
         if set(format_.MARKS) <= set(content):
             return format_.read(file, content, robot, options)

@@ -6,6 +6,7 @@ rate is the one in the file's name ("60hz"), or 30 Hz, that of LaFAN1.
 """
 
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from fmpjax.robots import Robot
 
 RATE = 30.0  # Hz
 MOST_BYTES = 1 << 29
+AT_ONCE = 4096  # lines whose cells are Python's objects at the same time
 MOST_RATE = 1000.0  # Hz, that a name or a column of times is trusted to mean
 SEPARATORS = (";", "\t", ",")  # the first that the first line has; else spaces
 _PLACE = re.compile(r"(?:.*[^a-z])?(?:x|y|z)$|.*(?:translate|trans|pos|position)(?:x|y|z)$")
@@ -108,8 +110,7 @@ def _rows(
 ) -> np.ndarray:
     """The numbers ``[T, columns]``."""
     if separator is None:
-        split = [line.split() for line in lines]
-        counts = list(map(len, split))
+        counts = [len(line.split()) for line in lines]
     else:
         trailing = all(line.rstrip("\r ").endswith(separator) for line in lines)
         if trailing:
@@ -128,16 +129,34 @@ def _rows(
                 f"{file}: line {number} has {count} columns, expected {columns}"
                 f"{' as the header has' if named else f' (root xyz, quaternion xyzw, {columns - 7} joints)'}"
             )
-    cells = [cell for row in split for cell in row] if separator is None else separator.join(lines).split(separator)
-    try:
-        values = np.array(list(map(float, cells)))
-    except ValueError:
-        at = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-        raise UserError(
-            f"{file}: line {at // columns + 1 + first}, column {at % columns + 1} is {cells[at].strip()[:40]!r}, "
-            "expected a number"
-        ) from None
-    return values.reshape(-1, columns)
+    values = np.empty((len(lines), columns))
+    for start in range(0, len(lines), AT_ONCE):
+        part = values[start : start + AT_ONCE]
+        text = (separator or " ").join(lines[start : start + AT_ONCE])
+        numbers = _parsed(text, separator)
+        if numbers is not None and numbers.size == part.size:
+            part[:] = numbers.reshape(part.shape)
+            continue
+        cells = text.split(separator)
+        try:
+            part[:] = np.array(list(map(float, cells))).reshape(part.shape)
+        except ValueError:
+            at = next(i for i, cell in enumerate(cells) if not _is_number(cell))
+            raise UserError(
+                f"{file}: line {start + at // columns + 1 + first}, column {at % columns + 1} is "
+                f"{cells[at].strip()[:40]!r}, expected a number"
+            ) from None
+    return values
+
+
+def _parsed(text: str, separator: str | None) -> np.ndarray | None:
+    """The numbers in a text by NumPy, which is quick and says nothing of what it can't read; None in that case."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            return np.fromstring(text, sep=separator or " ")
+        except (ValueError, DeprecationWarning):
+            return None
 
 
 def _layout(

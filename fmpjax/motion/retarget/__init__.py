@@ -1,4 +1,4 @@
-"""A human's motion on a robot: BVH motion capture by inverse kinematics.
+"""A human's motion on a robot: motion capture (BVH, SMPL) by inverse kinematics.
 
 The skeleton is scaled to the robot's legs. Trunk, thighs and arms point as the human's do; a limb has the robot's own
 length. A foot that stands in the source stands in the result: its sole lies on the floor and rolls over heel or toe
@@ -11,7 +11,7 @@ Landmarks are the parts of the body that a robot names in ``robot.toml``. Poses 
 the left, z up. `fmpjax motion retarget` is the command.
 """
 
-from fmpjax.motion.retarget.command import convert, odd_start
+from fmpjax.motion.retarget.command import convert, odd_start, read
 from fmpjax.motion.retarget.fit import Retargeted, retarget
 from fmpjax.motion.retarget.landmarks import AXES, JOINT_NAMES, SIDES, joints, read_skeleton
 from fmpjax.motion.retarget.targets import Targets
@@ -25,6 +25,7 @@ __all__ = [
     "convert",
     "joints",
     "odd_start",
+    "read",
     "read_skeleton",
     "retarget",
 ]

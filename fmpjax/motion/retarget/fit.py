@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from fmpjax.errors import UserError
-from fmpjax.motion import bvh, check
-from fmpjax.motion.bvh import Bvh
+from fmpjax.motion import check
 from fmpjax.motion.clip import Fact, MotionClip, Reading
 from fmpjax.motion.retarget import landmarks
 from fmpjax.motion.retarget.inverse import solve
 from fmpjax.motion.retarget.landmarks import AXES, JOINT_NAMES, SIDES, joints
 from fmpjax.motion.retarget.targets import Targets, leg_length, rest_positions, targets_of
+from fmpjax.motion.skeleton import Capture
 from fmpjax.robots import Robot
 
 MOST_RATE = 60.0  # Hz; of a faster source every second, third, ... frame is used
@@ -47,7 +47,7 @@ class Retargeted(NamedTuple):
 
 
 def retarget(
-    source: Bvh,
+    source: Capture,
     robot: Robot,
     name: str,
     *,
@@ -80,7 +80,7 @@ def retarget(
     if count < 2:
         raise UserError(f"{name}: the motion has {count} frame at {rate:g} Hz, expected at least two")
     joint = joints(source, name, skeleton)
-    axis, position, rotation_wxyz = _landmark_poses(source._replace(values=values), joint, up, name)
+    axis, position, rotation_wxyz = _landmark_poses(source.taken(values), joint, up, name)
     rest = rest_positions(robot)
     scale = leg_length(rest) / leg_length(position)
     reach = scale * max(float(np.abs(p).max()) for p in position.values())
@@ -97,15 +97,15 @@ def retarget(
     qpos, residual = solve(robot, targets, rate)
     thinned = f", one frame of {every}" if every > 1 else ""
     facts = (
+        Fact("format", source.format, f"{len(source.names)} joints, {len(source.values)} frames"),
         Fact("robot", robot.name, "as asked"),
         _skeleton_fact(source, joint, told=bool(skeleton)),
         Fact("up", axis, "--up" if up else "hips are over ankles along it"),
         Fact("size", f"{scale:.4g} m per unit", "legs as long as the robot's"),
         Fact("rate", f"{rate:g} Hz", f"the file's {source.rate:g} Hz{thinned}"),
     )
-    reading = Reading((Fact("format", "BVH", f"{len(source.names)} joints, {len(source.values)} frames"), *facts))
-    clip = MotionClip.from_qpos(name, robot.name, rate, qpos)
-    return Retargeted(dataclasses.replace(clip, reading=reading), residual, targets.contact, scale)
+    clip = dataclasses.replace(MotionClip.from_qpos(name, robot.name, rate, qpos), reading=Reading(facts))
+    return Retargeted(clip, residual, targets.contact, scale)
 
 
 def _check_landmarks(robot: Robot) -> None:
@@ -117,20 +117,22 @@ def _check_landmarks(robot: Robot) -> None:
         )
 
 
-def _landmark_poses(source: Bvh, joint: dict[str, int], up: str | None, name: str) -> tuple[str, dict, dict]:
+def _landmark_poses(source: Capture, joint: dict[str, int], up: str | None, name: str) -> tuple[str, dict, dict]:
     """The axis that is up, and positions ``[T, 3]`` and orientations ``[T, 4]`` of landmarks in the robot's axes."""
-    poses = bvh.joint_poses(source)
-    up = up or landmarks.up_axis(poses.position, joint, name)
+    poses = source.poses(list(joint.values()))
+    position = {part: poses.position[:, i] for i, part in enumerate(joint)}
+    up = up or landmarks.up_axis(position, name)
     axes = list(AXES[up])
-    position = {part: poses.position[:, j][:, axes] for part, j in joint.items()}
-    rotation_wxyz = {part: poses.rotation_wxyz[:, j][:, [0, *(1 + a for a in axes)]] for part, j in joint.items()}
+    position = {part: values[:, axes] for part, values in position.items()}
+    turned = [0, *(1 + a for a in axes)]
+    rotation_wxyz = {part: poses.rotation_wxyz[:, i][:, turned] for i, part in enumerate(joint)}
     for a, b in landmarks.segments():
         if not np.linalg.norm(position[a] - position[b], axis=-1).min() > 0:
             raise UserError(f"{name}: the skeleton's {a} and {b} are at one place, expected a distance")
     return up, position, rotation_wxyz
 
 
-def _skeleton_fact(source: Bvh, joint: dict[str, int], *, told: bool) -> Fact:
+def _skeleton_fact(source: Capture, joint: dict[str, int], *, told: bool) -> Fact:
     """Which joints were taken, on the left alone."""
     known = ", ".join(
         f"{part} {source.names[i]}" for part, i in joint.items() if part.startswith(("left", "pel", "ch"))

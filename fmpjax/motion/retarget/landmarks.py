@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fmpjax.errors import UserError
-from fmpjax.motion.bvh import Bvh
+from fmpjax.motion.skeleton import Capture
 
 SIDES = ("left", "right")
 # What skeletons call a limb's joint, beside left or l, right or r; where a skeleton has several, the first counts.
@@ -50,7 +50,7 @@ def read_skeleton(path: str | os.PathLike) -> dict[str, str]:
     return names
 
 
-def joints(source: Bvh, name: str, skeleton: dict[str, str] | None = None) -> dict[str, int]:
+def joints(source: Capture, name: str, skeleton: dict[str, str] | None = None) -> dict[str, int]:
     """Indices of the skeleton's joints by the part of the body.
 
     Raises:
@@ -99,14 +99,14 @@ def _plain(joint: str) -> str:
     return "".join(c for c in joint.removeprefix("mixamorig_") if c.isalnum())
 
 
-def _listed(source: Bvh) -> str:
+def _listed(source: Capture) -> str:
     names = ", ".join(source.names)
     return names if len(names) <= 300 else f"{names[:297]}..."
 
 
-def up_axis(position: np.ndarray, joint: dict[str, int], name: str) -> str:
-    """The file's axis that is up, by where the hips are seen from the ankles; ``position [T, J, 3]``."""
-    legs = sum(position[:, joint[f"{side}_hip"]] - position[:, joint[f"{side}_ankle"]] for side in SIDES)
+def up_axis(position: dict[str, np.ndarray], name: str) -> str:
+    """The file's axis that is up, by where the hips are seen from the ankles; each part's ``position`` is [T, 3]."""
+    legs = sum(position[f"{side}_hip"] - position[f"{side}_ankle"] for side in SIDES)
     legs = legs / np.maximum(np.linalg.norm(legs, axis=-1, keepdims=True), 1e-9)
     along = {axis: float(np.median(legs[:, "xyz".index(axis)])) for axis in AXES}
     up = max(along, key=along.__getitem__)

@@ -65,7 +65,7 @@ def test_skeleton(write):
 
 
 def test_nested_offsets_turn_with_their_parents(write):
-    position, rotation_wxyz = bvh.joint_poses(bvh.read(write(ARM)))
+    position, rotation_wxyz = bvh.read(write(ARM)).poses()
     # At rest the root stands at its channels, which replace the offset; the rest of the chain adds up.
     np.testing.assert_allclose(position[0], [[0, 0, 0], [0, 10, 0], [0, 10, 5], [2, 10, 5]], atol=1e-12)
     # The root turns y to -x, so the arm lies along -x. The arm's quarter turn about its own x axis, which now is the
@@ -79,7 +79,7 @@ def test_nested_offsets_turn_with_their_parents(write):
 def test_rotations_multiply_in_the_order_written(write, order):
     names = " ".join(f"{axis}rotation" for axis in order)
     text = f"HIERARCHY\nROOT a\n{{\nOFFSET 0 0 0\nCHANNELS 3 {names}\n}}\nMOTION\nFrames: 1\nFrame Time: 1\n10 20 30\n"
-    found = bvh.joint_poses(bvh.read(write(text))).rotation_wxyz[0, 0]
+    found = bvh.read(write(text)).poses().rotation_wxyz[0, 0]
     a, b, c = (quarter(axis, degrees) for axis, degrees in zip(order, (10, 20, 30), strict=True))
     np.testing.assert_allclose(found, rotations.multiply(rotations.multiply(a, b), c), atol=1e-12)
 
@@ -87,7 +87,7 @@ def test_rotations_multiply_in_the_order_written(write, order):
 def test_lone_position_channel_replaces_its_component(write):
     text = ARM.replace("CHANNELS 0", "CHANNELS 1 Yposition").replace("0 0 0 0 0 0 0 0 0", "0 0 0 0 0 0 0 0 0 4")
     text = text.replace("90 0\n", "90 0 4\n")
-    position = bvh.joint_poses(bvh.read(write(text))).position
+    position = bvh.read(write(text)).poses().position
     np.testing.assert_allclose(position[0, 2], [0, 14, 5], atol=1e-12)
 
 
@@ -210,5 +210,5 @@ def test_fuzz(write):
             refused += 1
             assert re.fullmatch(r"[^\n]{10,300}", str(error))
         else:
-            assert np.isfinite(bvh.joint_poses(found).position).all()
+            assert np.isfinite(found.poses().position).all()
     assert 100 < refused < 300

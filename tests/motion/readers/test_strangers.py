@@ -18,6 +18,7 @@ from fmpjax.errors import UserError
 from fmpjax.motion import formats
 from fmpjax.motion.readers import bodies as bodies_reader
 from fmpjax.motion.readers import pickled
+from fmpjax.motion.readers import text as text_reader
 
 ROBOT = robots.load("unitree_g1")
 NAMES = list(ROBOT.joint_names)
@@ -108,6 +109,19 @@ def test_degrees_are_refused_with_the_option_that_reads_them(tmp_path, qpos):
 def test_separators(tmp_path, qpos, separator, tail):
     tail = tail and separator.strip(" ")
     same(motion.load(text(tmp_path / "a.csv", qpos, separator=separator, tail=tail), fps=RATE), qpos)
+
+
+@pytest.mark.parametrize("separator", [",", " "])
+def test_a_long_file_is_read_a_part_at_a_time(tmp_path, qpos, separator, monkeypatch):
+    monkeypatch.setattr(text_reader, "AT_ONCE", 7)
+    path = text(tmp_path / "a_50hz.csv", qpos, separator=separator)
+    same(motion.load(path), qpos)
+    lines = path.read_text().split("\n")
+    cells = lines[38].split(separator)
+    cells[4] = "x"
+    lines[38] = separator.join(cells)
+    path.write_text("\n".join(lines))
+    refused(path, "line 39, column 5 is 'x', expected a number")
 
 
 def test_decimal_commas(tmp_path, qpos):
