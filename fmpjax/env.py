@@ -120,8 +120,8 @@ class Env:
         self._table = jax.tree.map(np.asarray, observe(jnp.asarray(self._qpos), jnp.asarray(self._qvel)))
         self.clip_rows = len(library.qpos)
         self.command = commands.make(config, robot, library, self._table.frame)
-        told = self.command.size if self.command else 0
-        self.disturbances = disturbances.make(config, robot, self.actions, told)
+        told = jax.eval_shape(lambda: self._told(self.first_command(jnp.arange(1))))
+        self.disturbances = disturbances.make(config, robot, self.actions, told.shape[-1] if self.command else 0)
 
     @property
     def observation_size(self) -> Any:
@@ -145,20 +145,27 @@ class Env:
         """
         if not self.disturbances:
             return now, self.seen(now.observed.actor, now.command)
-        told = self.command.observe(now.command) if self.command else ()
-        actor, disturbed = self.disturbances.sense(now.disturbed, now.physics, told, drawn)
+        actor, disturbed = self.disturbances.sense(now.disturbed, now.physics, self._told(now.command), drawn)
         critic = self._revealed(now.observed.actor, now.command, disturbed)
         return now._replace(disturbed=disturbed), Seen(actor, critic)
 
     def seen(self, actor: jax.Array, command: Any) -> jax.Array:
         """What the networks observe without disturbances, ``[..., O]``: the robot, and the command if there is one."""
-        return jnp.concatenate([actor, self.command.observe(command)], axis=-1) if self.command else actor
+        return jnp.concatenate([actor, self._told(command, whole=True)], axis=-1) if self.command else actor
+
+    def _told(self, command: Any, whole: bool = False) -> Any:
+        """What networks see of the command, ``[..., C]``; the ``whole`` also where the actor is deployable."""
+        if not self.command:
+            return ()
+        told = self.command.observe(command)
+        if self.command.reveal is None or not (whole or self.config.observation != "deployable"):
+            return told
+        return jnp.concatenate([told, self.command.reveal(command)], axis=-1)
 
     def _revealed(self, actor: jax.Array, command: Any, disturbed: disturbances.State) -> jax.Array:
         """What a critic sees with disturbances, ``[N, C]``: all that is true."""
         assert self.disturbances is not None
-        more = [self.command.reveal(command)] if self.command and self.command.reveal else []
-        return jnp.concatenate([self.seen(actor, command), *more, self.disturbances.reveal(disturbed)], axis=-1)
+        return jnp.concatenate([self.seen(actor, command), self.disturbances.reveal(disturbed)], axis=-1)
 
     def first_command(self, rows: jax.Array, key: jax.Array | None = None) -> Any:
         """Commands of episodes that begin at the table rows ``[N]``."""

@@ -119,11 +119,18 @@ def true_form(config: Config) -> str:
     return content if config.env.axes == "world" else f"{content} {config.env.axes}"
 
 
-def _command_terms(word: str) -> dict[str, int]:
-    """Names and widths of what a policy observes of its command, of that word of an observation's form."""
-    kind, _, motions = word.partition("-")
-    known = {"velocity": {"velocity_commands": 3}, "phase": {"clip_phase": 5}}
-    return {"motion_command": int(motions)} if kind == "motion" else known.get(kind, {})
+def _command_terms(form: str) -> dict[str, int]:
+    """Names and widths of what a policy observes of its command."""
+    content, *more = form.split()
+    for kind, _, motions in (word.partition("-") for word in more):
+        if kind == "velocity":
+            return {"velocity_commands": 3} | ({} if content == "deployable" else {"velocity_errors": 3})
+        if kind == "phase":
+            return {"clip_phase": 5}
+        if kind == "motion":
+            distances = {} if content == "deployable" else {"motion_distances": int(motions)}
+            return {"motion_command": int(motions)} | distances
+    return {}
 
 
 def observation_history(form: str) -> int:
@@ -142,7 +149,7 @@ def observation_terms(robot: Robot, form: str) -> dict[str, int]:
     """
     content, *more = form.split()
     joints, axes = robot.joint_count, "heading" if "heading" in more else "root"
-    told = {name: width for word in more for name, width in _command_terms(word).items()}
+    told = _command_terms(form)
     if content == "deployable":
         terms = {"base_ang_vel": 3, "projected_gravity": 3} | told
         terms |= {"joint_pos_rel": joints, "joint_vel_rel": joints, "last_action": joints}

@@ -136,6 +136,8 @@ def play(trainer: Trainer, state: PPOState, told: np.ndarray, rng: np.random.Gen
 @partial(jax.jit, static_argnums=0)
 def _play(trainer: Trainer, state: PPOState, rows: jax.Array, told: jax.Array):
     env, layout = trainer.env, FrameLayout.of(trainer.robot)
+    assert env.command is not None
+    obey = env.command.advance
     policy, start = trainer.ppo.act(state, deterministic=True), env.undisturbed(env.start_at(rows))
 
     def step(carry, inputs):
@@ -149,7 +151,8 @@ def _play(trainer: Trainer, state: PPOState, rows: jax.Array, told: jax.Array):
             return jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
         sim, observed = jax.tree.map(hold, (reached.physics, reached.observed), (now.physics, now.observed))
-        now = now._replace(physics=sim, observed=observed, disturbed=reached.disturbed)
+        told = obey(now.command, None, reached.observed.frame).state
+        now = now._replace(physics=sim, observed=observed, disturbed=reached.disturbed, command=told)
         alive = alive & ~reached.fell
         place = observed.frame[..., layout.root][..., :2]
         return (now, alive), (velocity.heading_velocity(observed.frame, layout), place, alive)

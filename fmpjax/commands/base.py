@@ -19,7 +19,7 @@ class Command(NamedTuple):
     # command that is held is held on.
     advance: Callable[[Any, Any, jax.Array], "Told"]
     observe: Callable[[Any], jax.Array]  # state -> [N, size]
-    # state -> [N, ...], what beside that a critic sees that sees more than the actor; None for nothing
+    # state -> [N, R], what else the reward depends on; a deployable actor does not see it. None for nothing
     reveal: Callable[[Any], jax.Array] | None = None
 
 

@@ -31,7 +31,8 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
     with the velocity that its demonstration has there. The default pose stands.
 
     A step earns by the running mean of the errors. In a walk the root turns and surges to and fro with every stride, by
-    more than an error that matters: of the error at the moment the reward would hardly depend.
+    more than an error that matters: the reward would hardly depend on the error at the moment. The networks see the
+    running mean, since without it they cannot tell what a step will earn.
 
     Args:
       config: of the command.

@@ -78,7 +78,10 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
         others = jnp.where(jnp.arange(count) == clip[..., None], jnp.inf, distance).min(-1)
         return others / jnp.maximum(told + others, 1e-9)
 
-    return Command(count, draw, begin, advance, lambda state: jax.nn.one_hot(state.clip, count))
+    def observe(state):
+        return jax.nn.one_hot(state.clip, count)
+
+    return Command(count, draw, begin, advance, observe, lambda state: state.distance)
 
 
 def posture(frame: jax.Array, layout: FrameLayout) -> jax.Array:

@@ -17,6 +17,7 @@ _UNMEASURED = {
     "key_points": "the places of key points",
     "heading_linear_velocity": "the root's linear velocity",
     "heading_key_points": "the places of key points",
+    "velocity_errors": "the errors of its velocity",
 }
 # Rows of the table of obedience, by their names in steering.json.
 _STEERING = {
@@ -79,10 +80,12 @@ _MEANING = {
     "heading_angular_velocity": "of the root, in those axes, rad/s",
     "heading_key_points": "of {points}: place less the root's, in those axes, m",
     "motion_command": "1 for the wanted motion, 0 for the others, in the order of the demonstrations",
+    "motion_distances": "running mean of the squared distance to each of them, docs/steering.md of fmpjax",
     "clip_phase": "share of the demonstration that is over, its sine and cosine once and twice per clip",
     "base_ang_vel": "of the root, in its own axes, rad/s",
     "projected_gravity": "where gravity points, a unit vector in the root's axes",
     "velocity_commands": "wanted velocity forward and to the left, m/s, and turn, rad/s",
+    "velocity_errors": "running mean of velocity less wanted velocity, m/s, m/s and rad/s, zero at the start",
     "joint_pos": "angles, rad, in the order of the joints",
     "joint_pos_rel": "angles less the offset of the action, rad, in the order of the joints",
     "joint_vel_rel": "rad/s, in the order of the joints",

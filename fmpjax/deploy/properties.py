@@ -39,6 +39,8 @@ def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
     return mjlab | {
         "observation_widths": _list(terms.values()),
         "command_ranges": _list(f"{low};{high}" for low, high in (origin.commands or {}).values()),
+        # s, time constant of the running means in velocity_errors
+        "command_average": str(origin.config.command.average),
         "action_offset": _list(policy.center),
         "action_clip": _pairs(policy.low, policy.high),
         "joint_effort": _list(robot.effort),

@@ -36,6 +36,7 @@ class Policy(NamedTuple):
     integrator: str  # MuJoCo's name of it, in training
     facts: dict[str, np.ndarray]  # what `facts` says of the model of the training
     robot: str
+    average: float = 0.5  # s, time constant of the running means of the velocity's errors
     commands: np.ndarray | None = None  # [2, 3] lowest and highest velocity that it may be told (m/s, m/s, rad/s)
 
 
@@ -112,6 +113,7 @@ def read(
             integrator=said["integrator"],
             facts={name: _rows(said[name]) for name in FACTS},
             robot=said["robot"],
+            average=float(said.get("command_average", 0.5)),
             commands=_rows(said["command_ranges"]).T if said.get("command_ranges") else None,
         )
     except KeyError as error:

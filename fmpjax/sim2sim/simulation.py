@@ -66,7 +66,7 @@ class Simulation:
         self._key_points = [(self._body(p, path), p["offset"]) for p in policy.key_points]
         self._falls = [(self._body(s, path), s["ends"], s["radius"]) for s in policy.fall_shapes]
         self.time, self.raised = 0.0, 0.0
-        self.command, self.action = np.zeros(3), np.zeros(len(ids))
+        self.command, self.errors, self.action = np.zeros(3), np.zeros(3), np.zeros(len(ids))
         self.reset()
         for name, width in policy.terms.items():
             if (found := policy.history * np.size(TERMS[name](self))) != width:
@@ -100,6 +100,7 @@ class Simulation:
         data.qpos[self._root + 2] += self.raised
         mujoco.mj_kinematics(self.model, data)
         self.time, self.action, self._past = 0.0, np.zeros(len(self._qpos)), []
+        self.errors = np.zeros(3)  # running mean of velocity less command: m/s, m/s, rad/s
 
     def place(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Start in a state in the policy's order, ``qpos [7 + J]`` and ``qvel [6 + J]``."""
@@ -109,6 +110,7 @@ class Simulation:
         data.qvel[self._root_dof : self._root_dof + 6], data.qvel[self._qvel] = qvel[:6], qvel[6:]
         mujoco.mj_kinematics(self.model, data)
         self.time, self.action, self.raised = 0.0, np.zeros(len(self._qpos)), 0.0
+        self.errors, self._past = np.zeros(3), []
 
     @property
     def root_body(self) -> int:
@@ -165,6 +167,8 @@ class Simulation:
         if not np.isfinite(self.data.qpos).all():
             return True
         mujoco.mj_kinematics(self.model, self.data)
+        newest = min(1.0, self.policy.step_dt / self.policy.average)
+        self.errors = self.errors + newest * (self.velocity() - self.command - self.errors)
         return any((self._point(body, ends)[:, 2] < radius).any() for body, ends, radius in self._falls)
 
     def velocity(self) -> np.ndarray:

@@ -231,8 +231,12 @@ def test_the_parts_of_an_observation_have_names_and_widths(robot):
     form = features.observation_form(settings)
     assert form == "compact heading velocity" and features.observation_form(preset("laptop")) == "compact"
     terms = features.observation_terms(robot, form)
-    assert list(terms)[-1] == "velocity_commands" and "heading_key_points" in terms and "key_points" not in terms
-    assert sum(terms.values()) == 89 and set(terms) <= set(TERMS)
+    assert (
+        list(terms)[-2:] == ["velocity_commands", "velocity_errors"]
+        and "heading_key_points" in terms
+        and "key_points" not in terms
+    )
+    assert sum(terms.values()) == 92 and set(terms) <= set(TERMS)
 
 
 # --- runs ------------------------------------------------------------------------------------------------------------

@@ -50,6 +50,7 @@ export const TERMS = {
   base_ang_vel: (sim) => sim.qvel.slice(3, 6),
   projected_gravity: (sim) => sim.axes.slice(6, 9).map((x) => -x),
   velocity_commands: (sim) => sim.command,
+  velocity_errors: (sim) => sim.errors,
   joint_pos: (sim) => sim.qpos.slice(7),
   joint_pos_rel: (sim) => sim.qpos.slice(7).map((angle, j) => angle - sim.policy.center[j]),
   joint_vel_rel: (sim) => sim.qvel.slice(6),

@@ -33,6 +33,8 @@ export async function load(bytes, wasm) {
     stepTime: Number(said.step_dt),
     // Lowest and highest command forward and to the left (m/s) and of the turn (rad/s); null without commands.
     ranges: said.command_ranges ? rows(said.command_ranges) : null,
+    average: Number(said.command_average ?? 0.5), // s, time constant of the running means of the velocity's errors
+    history: Math.max(1, ...numbers(said.observation_terms_history_length)), // steps that each term is of
     said,
   };
 }

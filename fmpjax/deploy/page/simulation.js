@@ -25,7 +25,7 @@ export class Simulation {
     this.command = [0, 0, 0];
     this.reset();
     for (const { name, width } of policy.terms) {
-      const found = TERMS[name]?.(this).length;
+      const found = policy.history * TERMS[name]?.(this).length;
       if (found !== width) throw new Error(`the policy observes ${width} numbers of ${name}: the page makes ${found}`);
     }
   }
@@ -50,6 +50,8 @@ export class Simulation {
     this.angles.forEach((at, j) => (data.qpos[at] = policy.defaultQpos[7 + j]));
     mujoco.mj_kinematics(model, data);
     this.action = policy.center.map(() => 0);
+    this.errors = [0, 0, 0]; // running mean of velocity less command: m/s, m/s, rad/s
+    this.past = []; // what was sensed at earlier steps, the oldest first
     this.fallen = false;
     this.force = null; // [3] N in the world
     this.pushedUntil = 0;
@@ -90,8 +92,18 @@ export class Simulation {
     return this.points.flatMap(({ body, offset }) => point(places, axes, body, offset).map((x, i) => x - this.place[i]));
   }
 
+  /** The policy's observation; ahead of the first steps stands the first again. */
   observe() {
-    return this.policy.terms.flatMap(({ name }) => Array.from(TERMS[name](this)));
+    const { terms, history } = this.policy;
+    const newest = this.#sensed();
+    const before = [...Array(history).fill(this.past[0] ?? newest), ...this.past];
+    const every = [...before, newest].slice(-history);
+    return terms.flatMap((_, i) => every.flatMap((step) => step[i]));
+  }
+
+  /** The parts of the observation of this step alone. */
+  #sensed() {
+    return this.policy.terms.map(({ name }) => Array.from(TERMS[name](this)));
   }
 
   /** Push the root for a moment: `force` [2] in N, forward and to the left of the robot. */
@@ -104,7 +116,9 @@ export class Simulation {
   /** One step of control. `fallen` says afterwards whether the robot has fallen since the reset. */
   async step() {
     const { mujoco, model, data, policy } = this;
-    this.action = await policy.act(this.observe());
+    const observation = this.observe();
+    if (policy.history > 1) this.past = [...this.past, this.#sensed()].slice(1 - policy.history);
+    this.action = await policy.act(observation);
     if (this.force && this.time > this.pushedUntil - 1e-9) this.force = null;
     const [control, applied] = [data.ctrl, data.xfrc_applied];
     this.servos.forEach((at, j) => (control[at] = policy.center[j] + policy.scale[j] * this.action[j]));
@@ -116,6 +130,9 @@ export class Simulation {
     }
     mujoco.mj_kinematics(model, data);
     this.#read();
+    const newest = Math.min(1, policy.stepTime / policy.average);
+    const velocity = this.velocity();
+    this.errors = this.errors.map((error, i) => error + newest * (velocity[i] - this.command[i] - error));
     const [places, axes] = [data.xpos, data.xmat];
     this.fallen ||= this.shapes.some(({ body, ends, radius }) =>
       ends.some((end) => point(places, axes, body, end)[2] < radius),
