@@ -11,6 +11,7 @@ import tyro
 
 from fmpjax import config as configuration
 from fmpjax import machine
+from fmpjax.config import explaining
 from fmpjax.errors import UserError
 from fmpjax.shell import default
 
@@ -40,7 +41,7 @@ def _setting(key: str) -> object:
         presets.setdefault(f"{value:,}" if isinstance(value, int) else value, []).append(name)
     if len(presets) == 1:
         return default(*presets)
-    return default(", ".join(f"{value} in {' and '.join(names)}" for value, names in presets.items()))
+    return default(", ".join(f"{value} in {explaining.enumerated(names)}" for value, names in presets.items()))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -55,18 +55,18 @@ def test_any_policy_is_played_under_any_disturbance(walk, name):
     changes = {} if name == "laptop" else {"env.observation": "deployable", "command.kind": "velocity"}
     trainer = Trainer(tiny(**changes), walk)
     player = robustness.Player(trainer, 6)
-    state = trainer.init(0).ppo
+    state, programs = trainer.init(0).ppo, robustness.Player._second._cache_size()
     calm = player.play(state, DisturbanceConfig())
     steps = trainer.config.env.episode_steps
     assert calm[0].shape == (steps, 6, 7 + trainer.robot.joint_count)
-    assert (calm[1] <= steps).all() and (calm[2] <= (calm[1] <= steps)).all()
+    assert (calm[1] <= steps).all() and ((calm[1] == steps) | calm[2]).all()
     again = player.play(state, DisturbanceConfig())
     for a, b in zip(calm, again, strict=True):
         np.testing.assert_array_equal(a, b)
     for case in robustness.cases(trainer.config)[1::3]:
         qpos, *_ = player.play(state, case.config)
         assert np.abs(qpos - calm[0]).max() > 1e-6, case
-    assert player._second._cache_size() == 1, "one program serves all cases"
+    assert robustness.Player._second._cache_size() == programs + 1, "one program serves all cases"
 
 
 @pytest.mark.slow

@@ -87,8 +87,8 @@ def test_the_list_of_studies_imports_none_of_them():
 def test_help_names_the_defaults_of_training(shown):
     text = " ".join(re.sub("[│\n]", " ", shown("fmpjax", "train", "--help")).split())
     for option, value in {
-        "method STR": "fmp", "motion STR": "walk in smoke and laptop and robust and paper, gaits in robot",
-        "robot STR": "unitree_g1 in smoke and laptop and robust and robot, unitree_g1_29dof in paper",
+        "method STR": "fmp", "motion STR": "walk in smoke, laptop, robust and paper, gaits in robot",
+        "robot STR": "unitree_g1 in smoke, laptop, robust and robot, unitree_g1_29dof in paper",
         "reset STR": "dataset", "seed INT": "0",
         "preset STR": "laptop on a CPU, paper on an accelerator",
         "transitions INT": "10,240 in smoke, 6,000,000 in laptop, 16,000,000 in robust and robot, 50,003,968 in paper",
@@ -99,7 +99,7 @@ def test_help_names_the_defaults_of_training(shown):
 def test_a_default_that_depends_on_the_preset_says_so(monkeypatch):
     monkeypatch.setattr(config.presets, "PRESETS", config.PRESETS | {"paper": {"robot": "another"}})
     said = cli_train._setting("robot").help_behavior_hint
-    assert said == "(default: unitree_g1 in smoke and laptop and robust and robot, another in paper)"
+    assert said == "(default: unitree_g1 in smoke, laptop, robust and robot, another in paper)"
     assert cli_train._setting("method").help_behavior_hint == "(default: fmp)"
 
 

@@ -6,7 +6,7 @@ import functools
 import inspect
 import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fmpjax.config.base import SOURCES, Section
@@ -108,6 +108,12 @@ def _shown(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value) or '""'
 
 
+def enumerated(names: Sequence[str]) -> str:
+    """Names as a sentence lists them: "a, b and c"."""
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
+
+
 def _differing(setting: Setting) -> str:
     """The paper's value, and the presets that depart from it."""
     (_, common), *others = setting.values.items()
@@ -115,7 +121,7 @@ def _differing(setting: Setting) -> str:
     for name, value in others:
         if value != common:
             differing.setdefault(_shown(value), []).append(name)
-    departures = ", ".join(f"{value} in {' and '.join(names)}" for value, names in differing.items())
+    departures = ", ".join(f"{value} in {enumerated(names)}" for value, names in differing.items())
     return _shown(common) + (f" ({departures})" if departures else "")
 
 

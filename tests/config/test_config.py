@@ -204,7 +204,7 @@ def test_a_meaning_is_the_comment_of_the_class_that_sets_the_default():
     assert known["env.count"].meaning == "parallel environments [P]"
     assert known["evaluations"].meaning.startswith("shares of the budget at which to evaluate [P]")  # it stands above
     assert known["wail.updates"].meaning != known["amp.updates"].meaning == known["gail.updates"].meaning
-    assert known["prior.updates"].values == {"paper": 128, "laptop": 3, "smoke": 2}
+    assert known["prior.updates"].values == {"paper": 128, "robot": 3, "robust": 3, "laptop": 3, "smoke": 2}
 
 
 def test_a_section_or_a_setting_is_explained(capsys):
@@ -214,8 +214,11 @@ def test_a_section_or_a_setting_is_explained(capsys):
     assert "[L] PWIL" in printed and "ppo." not in printed
     cli.main(["settings", "env.count"])
     printed = capsys.readouterr().out
-    assert printed.startswith("env.count = 1024 (128 in laptop, 16 in smoke)\n") and "env.reset" not in printed
-    assert "prior.query_share = 0.75 (1.0 in laptop and smoke)\n" in explaining.text()
+    assert (
+        printed.startswith("env.count = 1024 (128 in robot, robust and laptop, 16 in smoke)\n")
+        and "env.reset" not in printed
+    )
+    assert "prior.query_share = 0.75 (1.0 in robot, robust, laptop and smoke)\n" in explaining.text()
 
 
 @pytest.mark.parametrize(
