@@ -41,8 +41,8 @@ class Play:
                 raise UserError(f"--native shows one robot: expected one run or policy, not {len(self.what)}")
             play.check_display("--native")
         play.check_installed(page=not self.native)
-        sources = [play.source(path, name=self.checkpoint, model=self.model) for path in self.what]
+        sources = [play.source_of(path, name=self.checkpoint, model=self.model) for path in self.what]
         if self.native:
-            play.native(sources[0], gamepad=self.gamepad)
+            play.show(sources[0], gamepad=self.gamepad)
         else:
-            play.page(sources, host=self.host, port=self.port)
+            play.serve(sources, host=self.host, port=self.port)
