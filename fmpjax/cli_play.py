@@ -1,6 +1,7 @@
 """The command `fmpjax play`."""
 
 import dataclasses
+import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -45,4 +46,6 @@ class Play:
         if self.native:
             play.show(sources[0], gamepad=self.gamepad)
         else:
+            # A training with --live ends its page so; what reads checkpoints is to end with it.
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
             play.serve(sources, host=self.host, port=self.port)
