@@ -29,6 +29,8 @@ class Play:
     """Open MuJoCo's own viewer in place of a page, for one policy; needs a display."""
     gamepad: bool = False
     """Steer by a gamepad, too; with --native."""
+    parent: Annotated[int | None, tyro.conf.Suppress] = None
+    """Of `train --live`: the process without which the page ends."""
 
     def __call__(self) -> None:
         from fmpjax import play
@@ -48,4 +50,4 @@ class Play:
         else:
             # A training with --live ends its page so; what reads checkpoints is to end with it.
             signal.signal(signal.SIGTERM, signal.default_int_handler)
-            play.serve(sources, host=self.host, port=self.port)
+            play.serve(sources, host=self.host, port=self.port, parent=self.parent)

@@ -51,11 +51,11 @@ def check_display(option: str) -> None:
         raise UserError(f"{option} opens a window, and {reason}: without one, `fmpjax play` serves a page")
 
 
-def serve(sources: Sequence[Source], *, host: str, port: int) -> None:
-    """Serve sources as a page until Ctrl-C."""
+def serve(sources: Sequence[Source], *, host: str, port: int, parent: int | None = None) -> None:
+    """Serve sources as a page until Ctrl-C, or until the process ``parent``, which started this one, has ended."""
     from fmpjax.play.page import play
 
-    play(sources, host=host, port=port)
+    play(sources, host=host, port=port, parent=parent)
 
 
 def show(source: Source, *, gamepad: bool = False) -> None:

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -493,6 +494,13 @@ def test_a_motion_is_shown_with_its_check(robot, walk):
         page.server.stop()
     figures = [check.Figure("speed", 0.9), check.Figure("penetration", 0.5, "at 1.00 s")]
     assert verdicts(figures).splitlines()[0] == "✗ **penetration** 0.5 m (at 1.00 s)  "
+
+
+@needs_viser
+def test_a_page_ends_with_the_training_that_opened_it(robot, tmp_path, capsys):
+    file = saved(tmp_path / "policy.npz", robot)
+    play.serve([play.source_of(file)], host="127.0.0.1", port=0, parent=os.getppid() + 1)  # no parent of this process
+    assert "open http://localhost:" in capsys.readouterr().out
 
 
 def test_what_does_not_go_together_is_refused(run, robot, tmp_path, monkeypatch, capsys):

@@ -1,6 +1,7 @@
 """A run's policies for a page: what a checkpoint gives, what the prior says, and the files of a run that trains."""
 
 import json
+import os
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -99,7 +100,8 @@ def test_a_run_that_trains_writes_its_policy_now_and_then(run, monkeypatch):
     file = run.folder / policy.LIVE
     with served.Live([run], port=8123) as live:
         live.open(session)
-        assert started[0][1:] == ["-m", "fmpjax.cli", "play", str(run.folder), "--checkpoint", "live", "--port", "8123"]
+        command = ["-m", "fmpjax.cli", "play", str(run.folder), "--checkpoint", "live", "--port", "8123"]
+        assert started[0][1:] == [*command, "--parent", str(os.getpid())]
         assert read_npz(file).robot == "unitree_g1" and policy.metadata(file)["iteration"] == "0"
         session.done, now[0] = 2, 101.0
         live.show(session)
