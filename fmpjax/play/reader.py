@@ -52,8 +52,7 @@ class Reader:
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
         with self._lock:
-            if self._closed:
-                raise UserError(f"run {self._run} is closed: expected no more questions")
+            self._check_open()
             process = self._started()
             assert process.stdin and process.stdout  # they are pipes
             try:
@@ -63,6 +62,7 @@ class Reader:
             except (OSError, ValueError):  # a pipe that has closed
                 line = ""
             if not line:
+                self._check_open()
                 lines = Path(self._folder, "errors").read_text().strip().splitlines()
                 self._end()
                 told = lines[-1] if lines else "the process that reads it has ended"
@@ -71,6 +71,10 @@ class Reader:
         if "error" in answer:
             raise UserError(answer["error"])
         return answer
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise UserError(f"run {self._run} is closed: expected no more questions")
 
     def _started(self) -> subprocess.Popen[str]:
         if self._process is None:

@@ -87,6 +87,8 @@ def test_a_reader_asks_a_process(run, states, tmp_path):
         reader.policy(77)
     reader.close()
     assert not path.exists()
+    with pytest.raises(UserError, match="is closed: expected no more questions"):
+        reader.policy(0)
     with pytest.raises(UserError, match=r"run \S*none cannot be read: .*none is not a run folder"):
         Reader(tmp_path / "none").policy(0)
 
