@@ -70,4 +70,4 @@ class Sim2Sim:
         simulation = sim2sim.Simulation(sim2sim.load(self.policy), self.model, own_gains=self.gains == "model")
         for sentence in simulation.differences:
             print(f"unlike in training: {sentence}")
-        play.drive(simulation, gamepad=self.gamepad)
+        play.steer(simulation, gamepad=self.gamepad)

@@ -192,7 +192,7 @@ class View(Source):
             from fmpjax import play
 
             play.check_installed()
-            return play.clip(robot, clip, flips=flips, host=self.host, port=self.port)
+            return play.serve_motion(robot, clip, flips=flips, host=self.host, port=self.port)
         if self.out is None and show.has_display():
             show.play(robot, clip)
         else:

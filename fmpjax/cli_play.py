@@ -1,6 +1,7 @@
 """The command `fmpjax play`."""
 
 import dataclasses
+import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -28,6 +29,8 @@ class Play:
     """Open MuJoCo's own viewer in place of a page, for one policy; needs a display."""
     gamepad: bool = False
     """Steer by a gamepad, too; with --native."""
+    parent: Annotated[int | None, tyro.conf.Suppress] = None
+    """Of `train --live`: the process without which the page ends."""
 
     def __call__(self) -> None:
         from fmpjax import play
@@ -41,8 +44,10 @@ class Play:
                 raise UserError(f"--native shows one robot: expected one run or policy, not {len(self.what)}")
             play.check_display("--native")
         play.check_installed(page=not self.native)
-        sources = [play.source(path, name=self.checkpoint, model=self.model) for path in self.what]
+        sources = [play.source_of(path, name=self.checkpoint, model=self.model) for path in self.what]
         if self.native:
-            play.native(sources[0], gamepad=self.gamepad)
+            play.show(sources[0], gamepad=self.gamepad)
         else:
-            play.page(sources, host=self.host, port=self.port)
+            # A training with --live ends its page so; what reads checkpoints is to end with it.
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
+            play.serve(sources, host=self.host, port=self.port, parent=self.parent)

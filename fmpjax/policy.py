@@ -5,6 +5,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -112,7 +113,7 @@ def metadata(path: str | Path) -> dict[str, str]:
     try:
         with np.load(path) as file:
             said = json.loads(file["metadata"].item()) if "metadata" in file else None
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
         raise UserError(f"{path} is not a policy ({error}): {_EXPECTED}") from None
     if not (isinstance(said, dict) and all(isinstance(text, str) for text in said.values())):
         raise UserError(f"{path} does not say what its robot is: {_EXPECTED}")
@@ -134,5 +135,5 @@ def load(path: str | Path) -> Policy:
         arrays |= {name: arrays[name].item() for name in ("observation", "rate", "activation", "clip")}
         arrays["joint_names"] = tuple(map(str, arrays["joint_names"]))
         return Policy(**arrays)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
         raise UserError(f"{path} is not a policy ({error}): {_EXPECTED}") from None

@@ -36,7 +36,7 @@ def test_numpy_says_what_the_networks_say(tmp_path, observation, action, activat
     assert (loaded.observation, loaded.activation, loaded.rate) == (observation, activation, 50.0)
 
 
-@pytest.mark.parametrize("content", [None, b"not an archive", "other"])
+@pytest.mark.parametrize("content", [None, b"not an archive", b"PK\x03\x04 cut off", "other"])
 def test_what_is_no_policy_is_refused(tmp_path, content):
     path = tmp_path / "policy.npz"
     if content == "other":

@@ -12,11 +12,21 @@ from fmpjax.errors import UserError
 from fmpjax.motion import MotionClip
 from fmpjax.play.session import Session
 from fmpjax.play.source import Source
-from fmpjax.play.source import of as source
+from fmpjax.play.source import of as source_of
 from fmpjax.robots import Robot
 from fmpjax.sim2sim import Simulation
 
-__all__ = ["Session", "Source", "check_display", "check_installed", "clip", "drive", "native", "page", "source"]
+__all__ = [
+    "Session",
+    "Source",
+    "check_display",
+    "check_installed",
+    "serve",
+    "serve_motion",
+    "show",
+    "source_of",
+    "steer",
+]
 
 
 def check_installed(*, page: bool = True) -> None:
@@ -41,28 +51,28 @@ def check_display(option: str) -> None:
         raise UserError(f"{option} opens a window, and {reason}: without one, `fmpjax play` serves a page")
 
 
-def page(sources: Sequence[Source], *, host: str, port: int) -> None:
-    """Serve sources as a page until Ctrl-C."""
+def serve(sources: Sequence[Source], *, host: str, port: int, parent: int | None = None) -> None:
+    """Serve sources as a page until Ctrl-C, or until the process ``parent``, which started this one, has ended."""
     from fmpjax.play.page import play
 
-    play(sources, host=host, port=port)
+    play(sources, host=host, port=port, parent=parent)
 
 
-def native(source: Source, *, gamepad: bool = False) -> None:
+def show(source: Source, *, gamepad: bool = False) -> None:
     """Show a source in MuJoCo's viewer until its window is closed."""
     from fmpjax.play.native import play
 
     play(source, gamepad=gamepad)
 
 
-def drive(simulation: Simulation, *, gamepad: bool = False) -> None:
+def steer(simulation: Simulation, *, gamepad: bool = False) -> None:
     """Steer a simulation in MuJoCo's viewer, by its keys and by a gamepad, until its window is closed."""
     from fmpjax.play.native import drive
 
     drive(simulation, gamepad=gamepad)
 
 
-def clip(robot: Robot, shown: MotionClip, *, flips: int = 0, host: str, port: int) -> None:
+def serve_motion(robot: Robot, shown: MotionClip, *, flips: int = 0, host: str, port: int) -> None:
     """Serve a motion as a page until Ctrl-C."""
     from fmpjax.play.clip import play
 

@@ -1,6 +1,7 @@
 """A session in a page: the server, the robots, the controls, and the loop that keeps the page up to date."""
 
 import contextlib
+import os
 import sys
 import threading
 import time
@@ -89,8 +90,10 @@ def quick_turns() -> Generator[None]:
         sys.setswitchinterval(before)
 
 
-def play(sources: Sequence[Source], *, host: str = serving.HOST, port: int = serving.PORT) -> None:
-    """Serve a page until Ctrl-C.
+def play(
+    sources: Sequence[Source], *, host: str = serving.HOST, port: int = serving.PORT, parent: int | None = None
+) -> None:
+    """Serve a page until Ctrl-C, or until the process ``parent``, which started this one, has ended.
 
     Raises:
       UserError: a policy cannot be read, or the page cannot be opened.
@@ -104,7 +107,7 @@ def play(sources: Sequence[Source], *, host: str = serving.HOST, port: int = ser
             raise
         print(f"open {address(page.server)} in a browser; Ctrl-C ends it", flush=True)
         try:
-            page.show()
+            page.show(until=lambda: parent is not None and os.getppid() != parent)
         except KeyboardInterrupt:
             print()
         finally:

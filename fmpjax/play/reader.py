@@ -19,7 +19,7 @@ class Reader:
     def __init__(self, run: Path):
         self._run, self._lock = run, threading.Lock()
         self._process: subprocess.Popen[str] | None = None
-        self._folder = ""
+        self._folder, self._closed = "", False
 
     def policy(self, iteration: int | None, *, best: bool = False) -> Path:
         """File of a checkpoint's policy, by default the newest's.
@@ -39,7 +39,11 @@ class Reader:
         return answer["score"], answer["demonstration"]
 
     def close(self) -> None:
-        """End the process."""
+        """End the process; nothing can be asked from here on."""
+        self._closed = True
+        self._end()
+
+    def _end(self) -> None:
         process, self._process = self._process, None
         if process is not None:
             process.kill()
@@ -48,6 +52,7 @@ class Reader:
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
         with self._lock:
+            self._check_open()
             process = self._started()
             assert process.stdin and process.stdout  # they are pipes
             try:
@@ -57,14 +62,19 @@ class Reader:
             except (OSError, ValueError):  # a pipe that has closed
                 line = ""
             if not line:
+                self._check_open()
                 lines = Path(self._folder, "errors").read_text().strip().splitlines()
-                self.close()
+                self._end()
                 told = lines[-1] if lines else "the process that reads it has ended"
                 raise UserError(f"run {self._run} cannot be read: {told}")
         answer = json.loads(line)
         if "error" in answer:
             raise UserError(answer["error"])
         return answer
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise UserError(f"run {self._run} is closed: expected no more questions")
 
     def _started(self) -> subprocess.Popen[str]:
         if self._process is None:

@@ -127,7 +127,9 @@ class Live:
         self.show(session)
         folders = [str(run.folder) for run in self._group]
         command = [sys.executable, "-m", "fmpjax.cli", "play", *folders, "--checkpoint", "live"]
-        self._page = subprocess.Popen([*command, "--port", str(self._port)], start_new_session=True)
+        # A training that is killed cannot end its page, which therefore looks whether its parent is still there.
+        command += ["--port", str(self._port), "--parent", str(os.getpid())]
+        self._page = subprocess.Popen(command, start_new_session=True)
 
     def show(self, session: Session) -> None:
         """Write each run's policy, unless that was done a moment ago."""

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -310,7 +311,7 @@ def run(tmp_path, robot, walk, monkeypatch):
 
 
 def test_a_run_offers_its_checkpoints_and_new_ones(run, robot):
-    source = play.source(run)
+    source = play.source_of(run)
     assert source.names() == ["best", "newest", "200", "100"] and source.first == "best"
     assert [source.version(name) for name in ("best", "newest", "100", "300", "../100", "live")] == [
         "100", "200", "100", None, None, None,
@@ -325,7 +326,7 @@ def test_a_run_offers_its_checkpoints_and_new_ones(run, robot):
 
 
 def test_a_run_is_played_in_the_physics_of_its_training(run):
-    source = play.source(run, name="100")
+    source = play.source_of(run, name="100")
     one = source.player(source.load("100"))
     option, physics = one.simulation.model.opt, source.config.physics
     assert (option.timestep, option.iterations) == (physics.timestep, physics.iterations)
@@ -336,7 +337,7 @@ def test_a_run_is_played_in_the_physics_of_its_training(run):
 
 def test_the_live_policy_is_read_from_its_file(run, robot):
     saved(run / policy.LIVE, robot, 0.25)
-    source = play.source(run, name="live")
+    source = play.source_of(run, name="live")
     first = source.version("live")
     assert source.load("live").act(np.zeros(4))[0] == pytest.approx(0.25)
     assert source.score(*np.zeros((2, 12, 3))) is None  # its prior is in no file
@@ -353,27 +354,27 @@ def test_what_cannot_be_played_is_refused(run, robot, tmp_path):
         ({"path": saved(tmp_path / "a.npz", robot), "name": "best"}, "--checkpoint goes with a run"),
     ):
         with pytest.raises(UserError, match=sentence):
-            play.source(**arguments)
+            play.source_of(**arguments)
     for name in ("checkpoints", "best"):
         for path in (run / name).iterdir():
             path.rmdir()
     with pytest.raises(UserError, match="has no checkpoint: expected one, train it first"):
-        play.source(run)
+        play.source_of(run)
 
 
 def test_the_file_of_a_policy_stands_on_its_robot_or_another_model(robot, tmp_path):
-    source = play.source(saved(tmp_path / "policy.npz", robot))
+    source = play.source_of(saved(tmp_path / "policy.npz", robot))
     one = source.player(source.load("policy.npz"))
     assert one.simulation.model.opt.timestep == 0.005 and one.clips == () and source.names() == ["policy.npz"]
-    other = play.source(tmp_path / "policy.npz", model=robots.load("strider").path)
+    other = play.source_of(tmp_path / "policy.npz", model=robots.load("strider").path)
     with pytest.raises(UserError, match="robot.xml has no hinge .*: the policy moves unitree_g1"):
         other.player(other.load("policy.npz"))
-    strange = play.source(saved(tmp_path / "b.npz", robot, moves="strider"))
+    strange = play.source_of(saved(tmp_path / "b.npz", robot, moves="strider"))
     with pytest.raises(UserError, match="moves other joints than strider has: name its model with --model"):
         strange.player(strange.load("b.npz"))
     policy.save(tmp_path / "c.npz", policy.load(tmp_path / "b.npz"))
     with pytest.raises(UserError, match="c.npz does not say what its robot is: expected policy.npz"):
-        play.source(tmp_path / "c.npz").load("c.npz")
+        play.source_of(tmp_path / "c.npz").load("c.npz")
 
 
 def test_no_pickle_is_loaded(robot, tmp_path):
@@ -382,7 +383,7 @@ def test_no_pickle_is_loaded(robot, tmp_path):
     for name in ("metadata", "observation"):
         np.savez(tmp_path / "evil.npz", **arrays | {name: np.array({"a": 1}, dtype=object)})
         with pytest.raises(UserError, match="evil.npz is not a policy .*allow_pickle=False"):
-            play.source(tmp_path / "evil.npz").load("evil.npz")
+            play.source_of(tmp_path / "evil.npz").load("evil.npz")
 
 
 # --- the page --------------------------------------------------------------------------------------------------------
@@ -396,7 +397,7 @@ def page(run, robot, tmp_path):
     from fmpjax.play.page import Page
 
     file = saved(tmp_path / "policy.npz", robot)
-    opened = Page([play.source(run), play.source(file)], port=0)
+    opened = Page([play.source_of(run), play.source_of(file)], port=0)
     opened.session.pause(True)
     yield opened
     opened.close()
@@ -495,6 +496,13 @@ def test_a_motion_is_shown_with_its_check(robot, walk):
     assert verdicts(figures).splitlines()[0] == "✗ **penetration** 0.5 m (at 1.00 s)  "
 
 
+@needs_viser
+def test_a_page_ends_with_the_training_that_opened_it(robot, tmp_path, capsys):
+    file = saved(tmp_path / "policy.npz", robot)
+    play.serve([play.source_of(file)], host="127.0.0.1", port=0, parent=os.getppid() + 1)  # no parent of this process
+    assert "open http://localhost:" in capsys.readouterr().out
+
+
 def test_what_does_not_go_together_is_refused(run, robot, tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -575,7 +583,7 @@ def test_play_starts_without_jax(robot, tmp_path):
     path = saved(tmp_path / "policy.npz", robot)
     code = (
         "import sys; from pathlib import Path; from fmpjax import play, cli;"
-        f"source = play.source(Path({str(path)!r}));"
+        f"source = play.source_of(Path({str(path)!r}));"
         "session = play.Session([source.player(source.load('policy.npz'))]);"
         "session.tick(); print(sorted({'jax', 'flax', 'orbax'} & {name.split('.')[0] for name in sys.modules}))"
     )

@@ -1,6 +1,7 @@
 """A run's policies for a page: what a checkpoint gives, what the prior says, and the files of a run that trains."""
 
 import json
+import os
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -86,6 +87,8 @@ def test_a_reader_asks_a_process(run, states, tmp_path):
         reader.policy(77)
     reader.close()
     assert not path.exists()
+    with pytest.raises(UserError, match="is closed: expected no more questions"):
+        reader.policy(0)
     with pytest.raises(UserError, match=r"run \S*none cannot be read: .*none is not a run folder"):
         Reader(tmp_path / "none").policy(0)
 
@@ -99,7 +102,8 @@ def test_a_run_that_trains_writes_its_policy_now_and_then(run, monkeypatch):
     file = run.folder / policy.LIVE
     with served.Live([run], port=8123) as live:
         live.open(session)
-        assert started[0][1:] == ["-m", "fmpjax.cli", "play", str(run.folder), "--checkpoint", "live", "--port", "8123"]
+        command = ["-m", "fmpjax.cli", "play", str(run.folder), "--checkpoint", "live", "--port", "8123"]
+        assert started[0][1:] == [*command, "--parent", str(os.getpid())]
         assert read_npz(file).robot == "unitree_g1" and policy.metadata(file)["iteration"] == "0"
         session.done, now[0] = 2, 101.0
         live.show(session)
