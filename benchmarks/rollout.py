@@ -34,10 +34,9 @@ def seconds(call: Callable[[], object]) -> float:
     return time.perf_counter() - began
 
 
-def ways(env: Env, start: EnvState, steps: int) -> dict[str, Callable[[], object]]:
+def ways(env: Env, backend: NativePhysics, start: EnvState, steps: int) -> dict[str, Callable[[], object]]:
     """The four ways to play ``steps`` control steps from ``start``, compiled where they compile."""
-    backend, count = env.physics, len(start.age)
-    assert isinstance(backend, NativePhysics)
+    count = len(start.age)
     targets = jnp.broadcast_to(env.actions(jnp.zeros(env.robot.joint_count)), (count, env.robot.joint_count))
     qpos, qvel = np.asarray(start.physics.qpos, np.float64), np.asarray(start.physics.qvel, np.float64)
     initial = np.concatenate([np.zeros((count, 1)), qpos, qvel], axis=1)
@@ -95,7 +94,7 @@ def main() -> None:
     print(f"{'batch':>6}" + "".join(f"{n:>10}" for n in names) + "   steps/s" + "".join(f"{n:>10}" for n in names[1:]))
     for batch in arguments.batches:
         start = env.start_at(env.reset_rows(jax.random.PRNGKey(0), batch))
-        calls = ways(env, start, arguments.steps)
+        calls = ways(env, backend, start, arguments.steps)
         for call in calls.values():
             seconds(call)
         taken = np.array([[seconds(calls[n]) for n in names] for _ in range(arguments.rounds)])
