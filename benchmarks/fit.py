@@ -48,8 +48,8 @@ def parts(settings: PriorConfig, dimension, source, query, expert, params) -> di
     cross, itself, to_expert, to_source = costs(source, query, expert)
     entropy = jax.jit(lambda c: transport.entropy_coefficient(c, dimension, settings.epsilon_fraction))
     epsilon = entropy(cross)
-    limits = {"threshold": settings.sinkhorn_threshold, "max_iterations": settings.sinkhorn_iterations}
-    solve = jax.jit(lambda c, i, e: transport.solve(c, i, e, **limits))
+    threshold, most = settings.sinkhorn_threshold, settings.sinkhorn_iterations
+    solve = jax.jit(lambda c, i, e: transport.solve(c, i, e, threshold=threshold, max_iterations=most))
     solution = solve(cross, itself, epsilon)
 
     @jax.jit

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import config, features, motion, physics, robots
+from fmpjax import config, features, motion, robots
 from fmpjax.acting import ActionRule
 from fmpjax.env import Env, EnvState
 from fmpjax.physics.native import NativePhysics
@@ -34,9 +34,9 @@ def seconds(call: Callable[[], object]) -> float:
     return time.perf_counter() - began
 
 
-def ways(env: Env, start: EnvState, steps: int) -> dict[str, Callable[[], object]]:
+def ways(env: Env, backend: NativePhysics, start: EnvState, steps: int) -> dict[str, Callable[[], object]]:
     """The four ways to play ``steps`` control steps from ``start``, compiled where they compile."""
-    backend, count = env.physics, len(start.age)
+    count = len(start.age)
     targets = jnp.broadcast_to(env.actions(jnp.zeros(env.robot.joint_count)), (count, env.robot.joint_count))
     qpos, qvel = np.asarray(start.physics.qpos, np.float64), np.asarray(start.physics.qvel, np.float64)
     initial = np.concatenate([np.zeros((count, 1)), qpos, qvel], axis=1)
@@ -64,12 +64,12 @@ def ways(env: Env, start: EnvState, steps: int) -> dict[str, Callable[[], object
     def whole(state, key):
         return env.rollout(state, ActionRule(constant), key, steps)
 
-    callback, observed, whole = jax.jit(callback), jax.jit(observed), jax.jit(whole)
+    compiled = {name: jax.jit(way) for name, way in (("callback", callback), ("observed", observed), ("env", whole))}
     return {
         "mujoco": alone,
-        "callback": lambda: callback(start.physics, targets),
-        "observed": lambda: observed(start.physics, targets),
-        "env": lambda: whole(start, jax.random.PRNGKey(0)),
+        "callback": lambda: compiled["callback"](start.physics, targets),
+        "observed": lambda: compiled["observed"](start.physics, targets),
+        "env": lambda: compiled["env"](start, jax.random.PRNGKey(0)),
     }
 
 
@@ -84,8 +84,7 @@ def main() -> None:
     settings = config.preset(arguments.preset, **{"physics.backend": "native", "env.first_cap": 500})
     robot = robots.load(settings.robot)
     clip = motion.load(settings.motion, rate=settings.control_rate, robot=settings.robot)
-    backend = physics.make(robot, settings.physics)
-    assert isinstance(backend, NativePhysics)
+    backend = NativePhysics(robot, settings.physics)
     env = Env(robot, clip, settings, backend)
     print(
         f"{arguments.preset}: {1 / settings.physics.timestep:.0f} Hz physics, {backend.substeps} substeps, "
@@ -95,7 +94,7 @@ def main() -> None:
     print(f"{'batch':>6}" + "".join(f"{n:>10}" for n in names) + "   steps/s" + "".join(f"{n:>10}" for n in names[1:]))
     for batch in arguments.batches:
         start = env.start_at(env.reset_rows(jax.random.PRNGKey(0), batch))
-        calls = ways(env, start, arguments.steps)
+        calls = ways(env, backend, start, arguments.steps)
         for call in calls.values():
             seconds(call)
         taken = np.array([[seconds(calls[n]) for n in names] for _ in range(arguments.rounds)])

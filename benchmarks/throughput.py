@@ -162,7 +162,7 @@ def prepare(arguments, clip, environments: int, seeds: int, devices: int) -> Cas
     state = trainer.init() if seeds == 1 else stack([trainer.init(seed) for seed in range(seeds)])
     state = state if devices == 1 else trainer.place(state, sharding.mesh(devices))
     began = time.perf_counter()
-    program = trainer.compile(state)
+    program: Any = trainer.compile(state)
     compiled = time.perf_counter() - began
     memory = program.memory_analysis()
     count, _ = executed(program.as_text())
