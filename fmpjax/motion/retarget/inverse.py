@@ -47,12 +47,12 @@ def solve(robot: Robot, targets: Targets, rate: float) -> tuple[np.ndarray, np.n
     count = len(wanted)
     qpos, residual = np.empty((count, model.nq)), np.empty(count)
     for t in range(count):
-        for part, task in frame.items():
-            # A landmark without a target orientation has none that counts.
-            turned = targets.rotation_wxyz.get(part)
-            wxyz = data.xquat[robot.landmarks[part] + 1] if turned is None else turned[t]
-            task.set_target(mink.SE3(np.concatenate([wxyz, targets.position[part][t]])))
         for _ in range(FIRST_ITERATIONS if t == 0 else ITERATIONS):
+            for part, task in frame.items():
+                # A landmark without a target orientation is content with its own.
+                turned = targets.rotation_wxyz.get(part)
+                wxyz = data.xquat[robot.landmarks[part] + 1] if turned is None else turned[t]
+                task.set_target(mink.SE3(np.concatenate([wxyz, targets.position[part][t]])))
             step = mink.solve_ik(configuration, tasks, 1.0, solver="daqp", damping=DAMPING, limits=limits)
             configuration.integrate_inplace(step, 1.0)
             if np.abs(step).max() < SMALL_STEP:
