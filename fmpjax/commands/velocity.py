@@ -69,7 +69,9 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
         return Velocity(table[rows], drawn.left, jnp.zeros_like(drawn.value))
 
     def advance(state, drawn, frame):
-        off = state.off + newest * (heading_velocity(frame, layout) - state.value - state.off)
+        # After a large change of the command, only a leap would bring the mean of the whole error back to zero.
+        error = jnp.clip(heading_velocity(frame, layout) - state.value, -config.error_limit, config.error_limit)
+        off = state.off + newest * (error - state.off)
         held = state._replace(off=off)
         never = jnp.zeros(state.left.shape, bool)
         if drawn is None:

@@ -103,6 +103,11 @@ def test_the_reward_of_a_velocity_in_closed_form(robot, slow_and_left):
         expected = 0.7 / (1 + (0.2 * share) ** 2 / 0.25) + 0.3 / (1 + (0.2 * share) ** 2 / 0.16)
         np.testing.assert_allclose(reward, [expected], rtol=1e-5)
     np.testing.assert_allclose(state.off, [[0.072, 0.0, 0.072]], atol=1e-6)
+    # Of a large error 0.3 counts, whatever its sign.
+    far = velocity.Velocity(jnp.array([[5.0, 0.3, -4.0]]), jnp.array([1]), jnp.zeros((1, 3)))
+    off = command.advance(far, None, jnp.asarray(frame)).state.off
+    np.testing.assert_allclose(off, [[-0.06, 0.0, 0.06]], atol=1e-6)
+    np.testing.assert_array_equal(command.reveal(state), state.off)
 
 
 # --- motions ---------------------------------------------------------------------------------------------------------

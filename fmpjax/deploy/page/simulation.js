@@ -132,7 +132,8 @@ export class Simulation {
     this.#read();
     const newest = Math.min(1, policy.stepTime / policy.average);
     const velocity = this.velocity();
-    this.errors = this.errors.map((error, i) => error + newest * (velocity[i] - this.command[i] - error));
+    const counted = (i) => Math.max(-policy.errorLimit, Math.min(policy.errorLimit, velocity[i] - this.command[i]));
+    this.errors = this.errors.map((error, i) => error + newest * (counted(i) - error));
     const [places, axes] = [data.xpos, data.xmat];
     this.fallen ||= this.shapes.some(({ body, ends, radius }) =>
       ends.some((end) => point(places, axes, body, end)[2] < radius),
