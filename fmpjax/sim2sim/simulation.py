@@ -167,8 +167,9 @@ class Simulation:
         if not np.isfinite(self.data.qpos).all():
             return True
         mujoco.mj_kinematics(self.model, self.data)
-        newest, most = min(1.0, self.policy.step_dt / self.policy.average), self.policy.error_limit
-        self.errors = self.errors + newest * (np.clip(self.velocity() - self.command, -most, most) - self.errors)
+        if "velocity_errors" in self.policy.terms:
+            newest, most = min(1.0, self.policy.step_dt / self.policy.average), self.policy.error_limit
+            self.errors = self.errors + newest * (np.clip(self.velocity() - self.command, -most, most) - self.errors)
         return any((self._point(body, ends)[:, 2] < radius).any() for body, ends, radius in self._falls)
 
     def velocity(self) -> np.ndarray:

@@ -16,9 +16,11 @@ import numpy as np
 import pytest
 
 from fmpjax import cli, config, deploy, disturbances, features, physics, policy, resources, robots, runs
+from fmpjax.commands import velocity
 from fmpjax.config import preset
 from fmpjax.env import action_map
 from fmpjax.errors import UserError
+from fmpjax.motion import MotionLibrary
 from fmpjax.physics.native import NativePhysics
 from fmpjax.ppo import PPO
 from fmpjax.runs import outputs
@@ -328,13 +330,16 @@ def trained(request, robot, walk, tmp_path_factory):
     changes |= {"env.observation_history": 3} if content == "deployable" else {}
     made = small(robot, walk, **changes)
     folder = tmp_path_factory.mktemp("policy")
-    made.path, *_ = deploy.write(folder, made.policy, robot, made.origin)
+    ranges = {"lin_vel_x": (0.0, 1.2), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (-0.8, 0.8)} if told else None
+    made.path, *_ = deploy.write(folder, made.policy, robot, made.origin._replace(commands=ranges))
     native = NativePhysics(robot, made.config.physics)
     state = physics.reset(jnp.asarray(robot.default_qpos[None], jnp.float32), jnp.zeros((1, 6 + robot.joint_count)))
-    step, command = jax.jit(native.step), TOLD if told else []
-    observe = jax.jit(lambda *x: features.observe(robot, *x, request.param).actor)
+    step = jax.jit(native.step)
+    command = velocity.make(made.config.command, made.config.control_rate, robot, MotionLibrary.of(walk))
+    obeyed = velocity.Velocity(jnp.asarray(TOLD[None], jnp.float32), jnp.array([9]), jnp.zeros((1, 3)))
+    observe = jax.jit(lambda *x: features.observe(robot, *x, features.true_form(made.config)))
     actions = action_map(robot, walk, made.config.env.action)
-    sensors = disturbances.make(made.config, robot, actions, len(command))
+    sensors = disturbances.make(made.config, robot, actions, 3)
     sensed = sensors and sensors.init(jax.random.PRNGKey(0), 1)
     made.observations, made.states = [], []
     for _ in range(6):
@@ -342,11 +347,13 @@ def trained(request, robot, walk, tmp_path_factory):
             seen, sensed = sensors.sense(sensed, state, jnp.asarray(TOLD[None], jnp.float32), jnp.zeros((1, 0)))
             made.observations.append(np.asarray(seen[0]))
         else:
-            made.observations.append(np.concatenate([observe(state.qpos, state.qvel)[0], command]).astype(np.float32))
+            seen = [observe(state.qpos, state.qvel).actor, *([obeyed.value, obeyed.off] if told else [])]
+            made.observations.append(np.concatenate(seen, axis=-1)[0])
         targets = jnp.asarray(made.policy(made.observations[-1])[None])
         if sensors:
             (_, targets), sensed = sensors.act(sensed, state, (targets - actions.center) / actions.scale, None)
         state = step(state, jnp.asarray(targets, jnp.float32))
+        obeyed = command.advance(obeyed, None, observe(state.qpos, state.qvel).frame).state
         made.states.append(np.concatenate([state.qpos[0], state.qvel[0]]))
     made.options = {
         "timestep": made.config.physics.timestep,
