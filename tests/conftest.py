@@ -27,13 +27,15 @@ os.environ.setdefault("NPROC", str(2 * max(os.cpu_count() or 1, 4)))
 import jaxtyping
 import pytest
 
+import tests.shapes  # noqa: F401 - the hook finds it by its name
+
 # Before the package is imported: each call of these modules' functions is checked against its annotations.
 CHECKED = [
     f"fmpjax.{name}"
     for name in ("features", "frames", "learning", "potential", "priors.base", "priors.flow", "rotations", "transport")
 ]
 if os.environ.get("FMPJAX_TEST_SHAPES") != "0":
-    jaxtyping.install_import_hook(CHECKED, "beartype.beartype")
+    jaxtyping.install_import_hook(CHECKED, "tests.shapes.checked")
 
 from fmpjax import motion, robots  # noqa: E402
 
