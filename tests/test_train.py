@@ -395,7 +395,7 @@ def test_expert_bank_is_even_and_in_range(windows, size):
 
 
 def test_a_clip_of_another_rate_or_robot_is_refused(walk):
-    with pytest.raises(UserError, match="30 samples a second: expected the control rate, 50 Hz"):
+    with pytest.raises(UserError, match="30 samples per second: expected the control rate, 50 Hz"):
         Trainer(tiny(), dataclasses.replace(walk, rate=30.0))
     with pytest.raises(UserError, match="of robot 'other'"):
         Trainer(tiny(), dataclasses.replace(walk, robot="other"))

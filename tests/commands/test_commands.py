@@ -336,7 +336,7 @@ def told(tmp_path_factory):
 @pytest.mark.slow
 def test_a_run_is_told_velocities_and_measured(told, capsys):
     trainer, state = runs.Run.open(told).policy()
-    assert trainer.env.observation_size == 89 and state.env.command.value.shape == (8, 3)
+    assert trainer.env.observation_size == 92 and state.env.command.value.shape == (8, 3)
     rows = (told / "metrics.csv").read_text().splitlines()
     assert "command/reward" in rows[0]
     cli.main(["evaluate", str(told), "--commands", "--episodes", "4"])
