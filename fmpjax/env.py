@@ -6,6 +6,8 @@ indices point at the demonstration's own preceding frames, or repeat the default
 construction.
 """
 
+# long: the step and the rollout share their state, and are read together
+
 import dataclasses
 from typing import Any, NamedTuple
 

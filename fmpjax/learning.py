@@ -84,7 +84,7 @@ def step_if_finite(
     state: optax.OptState,
     loss: jax.Array,
     gradients: Any,
-    rate: jax.Array | None = None,
+    rate: jax.Array | float | None = None,
 ) -> Step:
     """A step of the optimizer, which is not taken where the loss or the gradients' norm is not finite.
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fmpjax import disturbances, features, motion, physics, robots
-from fmpjax.acting import Policy, Seen
+from fmpjax.acting import ActionRule, Seen
 from fmpjax.actions import action_map
 from fmpjax.config import DisturbanceConfig, preset
 from fmpjax.env import Env
@@ -296,7 +296,7 @@ def played():
     def act(observation, key):
         return 0.3 * jax.random.normal(key, (len(observation), joints)), {"saw": observation}
 
-    roll = jax.jit(lambda state, key: env.rollout(state, Policy(act), key, 8))
+    roll = jax.jit(lambda state, key: env.rollout(state, ActionRule(act), key, 8))
     start = env.reset(jax.random.PRNGKey(0))
     middle, first = roll(start, jax.random.PRNGKey(1))
     end, second = roll(middle, jax.random.PRNGKey(2))

@@ -76,8 +76,8 @@ def test_score_metrics_are_in_units_of_the_spread():
         "score_spread": 2.0,
         "expert_margin": 2.0,
     }
-    assert float(learning.score_metrics(2.0, jnp.float32(0.0), scores[3:], 0.5)["expert_margin"]) == 3.0
-    assert set(learning.score_metrics(0.0, 1.0)) == {"score_median", "score_spread"}
+    assert float(learning.score_metrics(jnp.float32(2.0), jnp.float32(0.0), scores[3:], 0.5)["expert_margin"]) == 3.0
+    assert set(learning.score_metrics(jnp.float32(0.0), jnp.float32(1.0))) == {"score_median", "score_spread"}
     # A number that is missing shows, unless it is left out on purpose.
     assert np.isnan(learning.median_and_spread(scores.at[0].set(jnp.nan))[0])
     assert float(learning.median_and_spread(scores.at[0].set(jnp.nan), jnp.nanquantile)[0]) == 2.5

@@ -65,7 +65,8 @@ def test_any_policy_is_played_under_any_disturbance(walk, name):
         np.testing.assert_array_equal(a, b)
     for case in robustness.cases(trainer.config)[1::3]:
         qpos, *_ = player.play(state, case.config)
-        assert np.abs(qpos - calm[0]).max() > 1e-6, case
+        # Torques of a policy that has learned nothing may stay below any limit.
+        assert case.disturbance == "motor strength" or np.abs(qpos - calm[0]).max() > 1e-6, case
     assert robustness.Player._second._cache_size() == programs + 1, "one program serves all cases"
 
 

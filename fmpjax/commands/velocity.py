@@ -40,6 +40,7 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
       robot: whose frames are read.
       library: the demonstrations, at the rate of their table's rows.
     """
+    # long: draws, start, step and reward of one command, which share its numbers
     table = jnp.asarray(np.concatenate([*map(velocities, library.clips), np.zeros((1, 3))]), jnp.float32)
     starts, lengths, weights = (jnp.asarray(x) for x in (library.starts, library.lengths, library.weights))
 

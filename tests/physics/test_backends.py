@@ -343,4 +343,4 @@ def test_physics_is_called_by_what_it_computes(robot):
     """The name in a program that is kept stands for the model and its options."""
     made = [physics.make(robot, c) for c in (LAPTOP, LAPTOP, PAPER, dataclasses.replace(LAPTOP, substeps=1))]
     assert made[0]._function == made[1]._function and len({each._function for each in made}) == 3
-    assert made[0]._pool is made[1]._pool and made[0]._pool is not made[2]._pool
+    assert made[0]._first is made[1]._first and made[0]._first is not made[2]._first
