@@ -145,7 +145,7 @@ class Player:
         everything = dataclasses.replace(
             MJLAB, torso_mass=(0.0, 0.0), joint_friction=(0.0, 0.0), delay=(0, 2 * config.physics.substeps)
         )
-        settings = dataclasses.replace(config.physics, impl="jax")
+        settings = dataclasses.replace(config.physics, backend="native")  # MJX does not have all of them
         everything = dataclasses.replace(config, disturbance=everything, physics=settings)
         backend = physics.make(trainer.robot, settings, joint_friction=True)
         self.env = Env(trainer.robot, trainer.library, everything, backend)

@@ -3,6 +3,7 @@
 import jax
 
 from fmpjax.config import PhysicsConfig
+from fmpjax.errors import UserError
 from fmpjax.physics.base import Physics, PhysicsState, reset
 from fmpjax.physics.traits import Traits
 from fmpjax.robots import Robot
@@ -12,6 +13,9 @@ def make(robot: Robot, config: PhysicsConfig, *, joint_friction: bool = False) -
     """The backend that the configuration names; ``auto`` is MJX where JAX sees an accelerator, else MuJoCo C.
 
     With ``joint_friction`` traits may give the joints dry friction where the model has none.
+
+    Raises:
+      UserError: joint friction is asked of MJX.
     """
     backend = config.backend
     if backend == "auto":
@@ -20,7 +24,9 @@ def make(robot: Robot, config: PhysicsConfig, *, joint_friction: bool = False) -
     if backend == "mjx":
         from fmpjax.physics.mjx import MjxPhysics
 
-        return MjxPhysics(robot, config, joint_friction=joint_friction)
+        if joint_friction:  # with it MJX was seen to leave MuJoCo C by a tenth of a radian in one control step
+            raise UserError("disturbance.joint_friction needs physics.backend=native: MJX does not agree with it there")
+        return MjxPhysics(robot, config)
     from fmpjax.physics.native import NativePhysics
 
     return NativePhysics(robot, config)

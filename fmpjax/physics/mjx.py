@@ -6,7 +6,6 @@ from typing import NoReturn
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
 from fmpjax import machine
 from fmpjax.config import PhysicsConfig
@@ -26,8 +25,7 @@ class MjxPhysics:
 
     name = "mjx"
 
-    def __init__(self, robot: Robot, config: PhysicsConfig, *, joint_friction: bool = False):
-        """The backend; with ``joint_friction`` traits may give the joints dry friction where the model has none."""
+    def __init__(self, robot: Robot, config: PhysicsConfig):
         self.robot, self.config = robot, config
         limits = {}
         if robot.self_collision and config.impl == "jax":
@@ -46,8 +44,6 @@ class MjxPhysics:
             self.model.opt.ls_iterations = min(config.ls_iterations, 6)
             # A tolerance made for float64 is never met in float32; Warp has the same floor.
             self.model.opt.tolerance = max(self.model.opt.tolerance, 1e-6)
-            if joint_friction:  # MJX makes room for it where the model has any
-                self.model.dof_frictionloss[6:] = np.maximum(self.model.dof_frictionloss[6:], 1e-6)
             self._model = mjx.put_model(self.model, impl=config.impl, device=self._device)
 
         self._step = jax.custom_batching.custom_vmap(self._advance)

@@ -123,6 +123,11 @@ def test_traits_of_batches_of_batches(robot, states):
         np.testing.assert_array_equal(a, np.reshape(b, a.shape))
 
 
+def test_joint_friction_is_refused_by_mjx(robot):
+    with pytest.raises(UserError, match="disturbance.joint_friction needs physics.backend=native"):
+        physics.make(robot, dataclasses.replace(LAPTOP, backend="mjx"), joint_friction=True)
+
+
 @pytest.mark.slow
 def test_mjx_agrees_on_traits(robot, states):
     qpos, qvel, targets = states
