@@ -229,11 +229,13 @@ class Synthesize:
     out: Path
     """File to write, .npz; a folder with --grid."""
     grid: bool = False
-    """Write a walk for each combination of --speeds and --turns that the legs reach."""
+    """Write a walk for each combination of --speeds, --turns and --sides that the legs reach."""
     speeds: tuple[float, ...] = (0.0, 0.4, 0.8, 1.2)
     """Of the grid, ahead, m/s."""
     turns: tuple[float, ...] = (-0.8, -0.4, 0.0, 0.4, 0.8)
-    """Of the grid, to the left, rad/s."""
+    """Of the grid, turning to the left, rad/s."""
+    sides: tuple[float, ...] = (0.0,)
+    """Of the grid, to the left, m/s."""
     speed: Annotated[float | None, default("the robot's own")] = None
     """Ahead, m/s, negative backward."""
     sideways: float = 0.0
@@ -264,13 +266,14 @@ class Synthesize:
         if self.out.suffix:
             raise UserError(f"--out is {self.out}: expected a folder with --grid")
         self.out.mkdir(parents=True, exist_ok=True)
-        for speed, turn in itertools.product(self.speeds, self.turns):
+        for speed, turn, side in itertools.product(self.speeds, self.turns, self.sides):
             try:
-                walk = gait.make(robot, gait.Command(speed, self.sideways, turn), rate=self.rate, style=self.style)
+                walk = gait.make(robot, gait.Command(speed, side, turn), rate=self.rate, style=self.style)
             except gait.OutOfReach as refused:
                 print(f"left out: {refused}")
                 continue
-            path = self.out / f"{speed:+.2f}_{turn:+.2f}.npz"
+            aside = f"_{side:+.2f}" if side else ""
+            path = self.out / f"{speed:+.2f}_{turn:+.2f}{aside}.npz"
             print(f"wrote {motion.save(walk.clip(self.duration), path)}", flush=True)
 
 

@@ -17,6 +17,7 @@ from fmpjax.ppo import PPOState
 from fmpjax.trainer import Trainer
 
 SPEEDS, TURNS = 7, 9  # cells of the grid ahead and turning
+SIDES = 5  # cells to the sides, where any are commanded
 CONSTANT = 10.0  # s, of an episode under one command
 SETTLING = 2.0  # s at its start that do not count
 LEG, LEGS = 3.0, 7  # s under each of an episode's changing commands, and their number
@@ -35,7 +36,8 @@ class Cell(NamedTuple):
     turned: float  # rad/s
     speed_error: float  # m/s, mean of the absolute errors of the episodes' mean speeds
     turn_error: float  # rad/s, the same of the turning
-    drift: float  # m/s to the left, mean of absolute values
+    drift: float  # m/s to the left of what is commanded, mean of absolute values
+    sideways: float = 0.0  # m/s to the left, commanded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,12 +49,14 @@ class Steering:
     turn_error: float  # rad/s
     episodes: int  # under constant commands
     falls: int
+    sideways_error: float  # m/s, mean over the commands to the sides; NaN without any
     straight_turn: float  # rad/s, mean of the absolute turning where the command is straight ahead
     standing_speed: float  # m/s, mean speed over the floor where the command is zero
     changing_episodes: int
     changing_falls: int
     changing_speed_error: float  # m/s
     changing_turn_error: float  # rad/s
+    changing_sideways_error: float  # m/s
     seconds: float = CONSTANT  # of an episode under a constant command
     changing_seconds: float = LEG * LEGS
 
@@ -79,17 +83,15 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 4, changing: i
         raise UserError(f"the run's command.kind is {config.kind!r}: expected 'velocity', whose grid is tried")
     rng, rate = np.random.default_rng(seed), trainer.config.control_rate
     low, high = velocity.extent(config, library)
-    speeds, turns = np.linspace(low[0], high[0], SPEEDS), np.linspace(low[2], high[2], TURNS)
-    for values in (speeds, turns):
-        values[np.abs(values).argmin()] = 0.0  # standing and straight ahead are among them: zero is within the extent
-    grid = np.array([(v, 0.0, w) for v in speeds for w in turns])
+    grid = _grid(low, high)
     told = np.repeat(grid, episodes, axis=0)[None]
     steps = round(CONSTANT * rate)
     played = play(trainer, state, np.repeat(told, steps, axis=0), rng)
     reached = np.where(played.fell[:, None], np.nan, played.velocity[round(SETTLING * rate) :].mean(0))
     cells = _cells(grid, reached.reshape(len(grid), episodes, 3), played.fell.reshape(len(grid), episodes))
-    straight = [cell for cell in cells if cell.turn == 0 and cell.ahead > 0]
-    still = [i for i, (v, _, w) in enumerate(grid) if v == 0 and w == 0]
+    plane, aside = cells[: SPEEDS * TURNS], cells[SPEEDS * TURNS :]
+    straight = [cell for cell in plane if cell.turn == 0 and cell.ahead > 0]
+    still = np.flatnonzero((grid == 0).all(1))
     way = np.linalg.norm(played.place[-1] - played.place[round(SETTLING * rate)], axis=-1) / (CONSTANT - SETTLING)
     way = np.where(played.fell, np.nan, way).reshape(len(grid), episodes)
 
@@ -101,17 +103,28 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 4, changing: i
     off = np.abs(means - legs)[moved.alive.reshape(LEGS, length, changing)[:, -1]]
     return Steering(
         cells=tuple(cells),
-        speed_error=_mean([cell.speed_error for cell in cells]),
-        turn_error=_mean([cell.turn_error for cell in cells]),
+        speed_error=_mean([cell.speed_error for cell in plane]),
+        turn_error=_mean([cell.turn_error for cell in plane]),
         episodes=told.shape[1],
         falls=int(played.fell.sum()),
+        sideways_error=_mean([cell.drift for cell in aside]),
         straight_turn=_mean([abs(cell.turned) for cell in straight]),
         standing_speed=_mean(way[still].ravel()),
         changing_episodes=changing,
         changing_falls=int(moved.fell.sum()),
         changing_speed_error=_mean(off[:, 0]),
         changing_turn_error=_mean(off[:, 2]),
+        changing_sideways_error=_mean(off[:, 1]),
     )
+
+
+def _grid(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Constant commands ``[C, 3]`` within an extent: `SPEEDS` by `TURNS` ones, then those straight to the sides."""
+    speeds, turns = np.linspace(low[0], high[0], SPEEDS), np.linspace(low[2], high[2], TURNS)
+    for values in (speeds, turns):
+        values[np.abs(values).argmin()] = 0.0  # standing and straight ahead are among them: zero is within the extent
+    sides = [side for side in np.linspace(low[1], high[1], SIDES) if abs(side) > 1e-6] if low[1] < high[1] else []
+    return np.array([(v, 0.0, w) for v in speeds for w in turns] + [(0.0, side, 0.0) for side in sides])
 
 
 class Played(NamedTuple):
@@ -178,6 +191,7 @@ def _cells(grid: np.ndarray, reached: np.ndarray, fell: np.ndarray) -> list[Cell
                 speed_error=_mean(off[:, 0]),
                 turn_error=_mean(off[:, 2]),
                 drift=_mean(off[:, 1]),
+                sideways=float(command[1]),
             )
         )
     return cells
@@ -196,25 +210,27 @@ def table(steering: Steering) -> str:
         ("mean error of the speed", f"{s.speed_error:.3f}", f"m/s, constant commands, {s.seconds:g} s each"),
         ("mean error of the turning", f"{s.turn_error:.3f}", "rad/s"),
         ("falls", f"{s.falls} of {s.episodes}", ""),
+        ("mean error to the sides", f"{s.sideways_error:.3f}", "m/s, commands to the sides"),
         ("turning when told to go straight", f"{s.straight_turn:.3f}", "rad/s"),
         ("speed when told to stand", f"{s.standing_speed:.3f}", "m/s over the floor"),
         ("mean error of the speed", f"{s.changing_speed_error:.3f}", f"m/s, a new command every {LEG:g} s"),
         ("mean error of the turning", f"{s.changing_turn_error:.3f}", "rad/s"),
+        ("mean error to the sides", f"{s.changing_sideways_error:.3f}", "m/s"),
         ("falls", f"{s.changing_falls} of {s.changing_episodes}", f"in {s.changing_seconds:g} s"),
     ]
-    return tables.lines("  {:<36} {:>20}  {}", rows)
+    aside = any(cell.sideways for cell in s.cells)
+    return tables.lines("  {:<36} {:>20}  {}", [row for row in rows if aside or "sides" not in row[0]])
 
 
 def maps(steering: Steering) -> tuple[list[float], list[float], dict[str, np.ndarray]]:
     """Speeds of the rows, turning rates of the columns, and maps of errors and falls by title."""
-    speeds, turns = (sorted({getattr(cell, name) for cell in steering.cells}) for name in ("ahead", "turn"))
+    plane = [cell for cell in steering.cells if not cell.sideways]
+    speeds, turns = (sorted({getattr(cell, name) for cell in plane}) for name in ("ahead", "turn"))
     shape = len(speeds), len(turns)
     titles = {
         "speed_error": "mean error of the speed, m/s",
         "turn_error": "mean error of the turning, rad/s",
-        "falls": f"falls of {steering.cells[0].episodes} episodes",
+        "falls": f"falls of {plane[0].episodes} episodes",
     }
-    values = {
-        t: np.array([getattr(cell, n) for cell in steering.cells], float).reshape(shape) for n, t in titles.items()
-    }
+    values = {t: np.array([getattr(cell, n) for cell in plane], float).reshape(shape) for n, t in titles.items()}
     return speeds, turns, values

@@ -304,9 +304,10 @@ def test_a_shipped_gait_is_the_generators(robot):
 
 def test_a_grid_of_gaits_is_a_folder(tmp_path, capsys):
     """What is out of reach is said and left out; a file is no folder."""
-    out = ["motion", "synthesize", "--grid", "--out", str(tmp_path / "mine"), "--duration", "2", "--turns", "0"]
+    out = ["motion", "synthesize", "--grid", "--out", str(tmp_path / "mine"), "--duration", "2", "--turns", "0", "--sides", "0", "0.3"]
     cli.main([*out, "--speeds", "0", "9"])
-    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["+0.00_+0.00.npz"]
+    names = sorted(path.name for path in (tmp_path / "mine").iterdir())
+    assert names == ["+0.00_+0.00.npz", "+0.00_+0.00_+0.30.npz"]
     assert "left out: speed 9 m/s is out of the legs' reach" in capsys.readouterr().out
     with pytest.raises(SystemExit) as stop:
         cli.main(["motion", "synthesize", "--grid", "--out", str(tmp_path / "mine.npz")])
@@ -356,6 +357,15 @@ def test_a_run_without_commands_has_no_grid(robot, walk):
 def test_phase_constants_make_one():
     parts = (phase.JOINTS, phase.JOINT_VELOCITIES, phase.HEIGHT, phase.TILT)
     assert sum(share for share, _ in parts) == pytest.approx(1.0)
+
+
+def test_commands_to_the_sides_are_tried_where_there_are_any():
+    low, high = np.array([0.0, 0.0, -0.8]), np.array([1.3, 0.0, 0.8])
+    grid = steering._grid(low, high)
+    assert grid.shape == (steering.SPEEDS * steering.TURNS, 3) and not grid[:, 1].any()
+    wide = steering._grid(low + [-0.5, -0.4, 0.0], high + [0.0, 0.4, 0.0])
+    np.testing.assert_allclose(wide[len(grid) :], [(0.0, side, 0.0) for side in (-0.4, -0.2, 0.2, 0.4)])
+    assert (wide == 0).all(1).any() and wide[:, 0].min() == -0.5
 
 
 def test_figures_of_cells():
