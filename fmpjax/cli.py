@@ -30,7 +30,7 @@ class Evaluate:
     last: bool = False
     """Take the newest checkpoint in place of the best."""
     commands: bool = False
-    """Measure how well a policy that is told velocities obeys them; docs/steering.md."""
+    """Measure how well a policy obeys the velocities, or follows the clip's time, that it is told; docs/steering.md."""
     robust: bool = False
     """Measure how well any policy stays up under pushes, delays and other disturbances; docs/robustness.md."""
 
@@ -57,18 +57,28 @@ class Evaluate:
 
     def _commands(self) -> None:
         runs = runs_module()
-        from fmpjax import steering
+        from fmpjax import following, steering
         from fmpjax.files import write
-        from fmpjax.viz import heat
+        from fmpjax.viz import along, heat
 
         if self.episodes is not None and self.episodes < 1:
             raise UserError(f"--episodes is {self.episodes}: expected at least 1")
         run = runs.Run.open(self.run)
         trainer, state = run.policy(best=not self.last)
         print("compiling the episodes ...", flush=True)
-        found = steering.measure(trainer, state.ppo, **({} if self.episodes is None else {"changing": self.episodes}))
+        last = "-last" if self.last else ""
+        changed = {} if self.episodes is None else {"episodes": self.episodes}
+        if trainer.config.command.kind == "phase":
+            followed = following.measure(trainer, state.ppo, **changed)
+            print(f"iteration {int(state.iteration):,}:\n{following.table(followed)}")
+            path = run.folder / f"following{last}.json"
+            write(path, followed.to_json())
+            picture = along.draw(path.with_suffix(".png"), followed.seconds, following.curves(followed))
+            print(f"wrote {path}\nwrote {picture}")
+            return
+        found = steering.measure(trainer, state.ppo, **changed)
         print(f"iteration {int(state.iteration):,}:\n{steering.table(found)}")
-        path = run.folder / ("steering-last.json" if self.last else "steering.json")
+        path = run.folder / f"steering{last}.json"
         write(path, found.to_json())
         print(f"wrote {path}\nwrote {heat.draw(path.with_suffix('.png'), *steering.maps(found))}")
 

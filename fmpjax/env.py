@@ -114,8 +114,8 @@ class Env:
         self.library = library = dataclasses.replace(
             library, clips=tuple(refined(clip, self.stride) for clip in library.clips)
         )
-        # Rows of its clip that a row needs ahead of it to end a window.
-        self._before = 0 if config.env.early_frames else (self.horizon - 1) * self.stride
+        # The first row of a clip at which an episode may begin: a window needs rows ahead of it.
+        self.first_row = 0 if config.env.early_frames else (self.horizon - 1) * self.stride
         # Rows 0..M-1 are the demonstrations, row M the default pose; resets gather from here.
         self._qpos = np.concatenate([library.qpos, robot.default_qpos[None]]).astype(np.float32)
         self._qvel = np.concatenate([library.qvel, np.zeros_like(library.qvel[:1])]).astype(np.float32)
@@ -175,14 +175,19 @@ class Env:
             return ()
         return self.command.begin(rows, self.command.draw(jax.random.PRNGKey(0) if key is None else key, rows.shape))
 
+    @property
+    def clip_frames(self) -> jax.Array:
+        """Compact frames of the demonstrations' rows, ``[M, F]``."""
+        return jnp.asarray(self._table.frame)[: self.clip_rows]
+
     def clip_windows(self) -> jax.Array:
         """The demonstrations' windows of compact frames, ``[W, H, F]``: all of them, or about `MOST_WINDOWS`."""
-        rows = self.library.rows_after(self._before, MOST_WINDOWS)
+        rows = self.library.rows_after(self.first_row, MOST_WINDOWS)
         return jnp.asarray(self._table.frame)[self.history_rows(rows)]
 
     def window_share(self) -> np.ndarray | None:
         """How often each of those windows is drawn, ``[W]``, summing to one; None where all are alike."""
-        return self.library.share_after(self._before, MOST_WINDOWS)
+        return self.library.share_after(self.first_row, MOST_WINDOWS)
 
     def clip_of(self, rows: np.ndarray) -> np.ndarray:
         """Index of the demonstration of each table row, 0 for the default pose."""
@@ -193,11 +198,11 @@ class Env:
         if self.config.reset == "fixed":
             return jnp.full((count,), self.clip_rows)
         if len(self.library.clips) == 1:
-            return jax.random.randint(key, (count,), self._before, self.clip_rows)
+            return jax.random.randint(key, (count,), self.first_row, self.clip_rows)
         starts, lengths = self.library.starts, self.library.lengths
         weights = jnp.asarray(self.library.weights)
         clip = jax.random.choice(jax.random.fold_in(key, 1), len(starts), (count,), p=weights)
-        first, end = jnp.asarray(starts + self._before), jnp.asarray(starts + lengths)
+        first, end = jnp.asarray(starts + self.first_row), jnp.asarray(starts + lengths)
         return jax.random.randint(key, (count,), first[clip], end[clip])
 
     def history_rows(self, rows: jax.Array | np.ndarray) -> jax.Array:

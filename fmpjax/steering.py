@@ -65,14 +65,14 @@ class Steering:
         return jsons.dumps(vars(self) | {"cells": [cell._asdict() for cell in self.cells]})
 
 
-def measure(trainer: Trainer, state: PPOState, *, episodes: int = 4, changing: int = 256, seed: int = 1) -> Steering:
+def measure(trainer: Trainer, state: PPOState, *, episodes: int = 256, each: int = 4, seed: int = 1) -> Steering:
     """Play the deterministic policy under commands and measure how it obeys.
 
     Args:
       trainer: of a run whose command is a velocity.
       state: of the policy.
-      episodes: under each constant command, from different states of the nearest demonstration.
-      changing: episodes under commands that change.
+      episodes: under commands that change.
+      each: episodes under each constant command, from different states of the nearest demonstration.
       seed: of starts and changing commands.
 
     Raises:
@@ -84,23 +84,23 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 4, changing: i
     rng, rate = np.random.default_rng(seed), trainer.config.control_rate
     low, high = velocity.extent(config, library)
     grid = _grid(low, high)
-    told = np.repeat(grid, episodes, axis=0)[None]
+    told = np.repeat(grid, each, axis=0)[None]
     steps = round(CONSTANT * rate)
     played = play(trainer, state, np.repeat(told, steps, axis=0), rng)
     reached = np.where(played.fell[:, None], np.nan, played.velocity[round(SETTLING * rate) :].mean(0))
-    cells = _cells(grid, reached.reshape(len(grid), episodes, 3), played.fell.reshape(len(grid), episodes))
+    cells = _cells(grid, reached.reshape(len(grid), each, 3), played.fell.reshape(len(grid), each))
     plane, aside = cells[: SPEEDS * TURNS], cells[SPEEDS * TURNS :]
     straight = [cell for cell in plane if cell.turn == 0 and cell.ahead > 0]
     still = np.flatnonzero((grid == 0).all(1))
     way = np.linalg.norm(played.place[-1] - played.place[round(SETTLING * rate)], axis=-1) / (CONSTANT - SETTLING)
-    way = np.where(played.fell, np.nan, way).reshape(len(grid), episodes)
+    way = np.where(played.fell, np.nan, way).reshape(len(grid), each)
 
-    legs = rng.uniform(low, high, (LEGS, changing, 3))
-    legs[rng.uniform(size=(LEGS, changing)) < ZERO] = 0.0
+    legs = rng.uniform(low, high, (LEGS, episodes, 3))
+    legs[rng.uniform(size=(LEGS, episodes)) < ZERO] = 0.0
     length = round(LEG * rate)
     moved = play(trainer, state, np.repeat(legs, length, axis=0), rng)
-    means = moved.velocity.reshape(LEGS, length, changing, 3)[:, round(FOLLOWING * rate) :].mean(1)
-    off = np.abs(means - legs)[moved.alive.reshape(LEGS, length, changing)[:, -1]]
+    means = moved.velocity.reshape(LEGS, length, episodes, 3)[:, round(FOLLOWING * rate) :].mean(1)
+    off = np.abs(means - legs)[moved.alive.reshape(LEGS, length, episodes)[:, -1]]
     return Steering(
         cells=tuple(cells),
         speed_error=_mean([cell.speed_error for cell in plane]),
@@ -110,7 +110,7 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 4, changing: i
         sideways_error=_mean([cell.drift for cell in aside]),
         straight_turn=_mean([abs(cell.turned) for cell in straight]),
         standing_speed=_mean(way[still].ravel()),
-        changing_episodes=changing,
+        changing_episodes=episodes,
         changing_falls=int(moved.fell.sum()),
         changing_speed_error=_mean(off[:, 0]),
         changing_turn_error=_mean(off[:, 2]),

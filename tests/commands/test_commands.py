@@ -304,8 +304,21 @@ def test_a_shipped_gait_is_the_generators(robot):
 
 def test_a_grid_of_gaits_is_a_folder(tmp_path, capsys):
     """What is out of reach is said and left out; a file is no folder."""
-    out = ["motion", "synthesize", "--grid", "--out", str(tmp_path / "mine"), "--duration", "2", "--turns", "0", "--sides", "0", "0.3"]
-    cli.main([*out, "--speeds", "0", "9"])
+    out = [
+        "motion",
+        "synthesize",
+        "--grid",
+        "--out",
+        str(tmp_path / "mine"),
+        "--duration",
+        "2",
+        "--turns",
+        "0",
+        "--sides",
+        "0",
+        "0.3",
+    ]
+    cli.main([*out, "--speeds", "0", "9", "--sides", "0", "0.3"])
     names = sorted(path.name for path in (tmp_path / "mine").iterdir())
     assert names == ["+0.00_+0.00.npz", "+0.00_+0.00_+0.30.npz"]
     assert "left out: speed 9 m/s is out of the legs' reach" in capsys.readouterr().out
