@@ -110,10 +110,14 @@ class Render:
     """Folder of the run."""
     seconds: float = 10.0
     """Length at most."""
+    last: bool = False
+    """Take the newest checkpoint in place of the best."""
     out: Annotated[Path | None, default("RUN/policy.mp4")] = None
     """File to write; .gif where no encoder is installed."""
     alone: bool = False
     """Leave the demonstration out, whose licence may not let a picture of it be passed on."""
+    course: Annotated[tuple[str, ...], default("none")] = ()
+    """Of a policy that is told velocities: commands as 4:0.5,0,0.4, seconds, ahead and left (m/s), turning (rad/s)."""
 
     def __call__(self) -> None:
         runs = runs_module()
@@ -122,8 +126,13 @@ class Render:
         if not 0 < self.seconds < math.inf:
             raise UserError(f"--seconds is {self.seconds:g}: expected a number above 0")
         run = runs.Run.open(self.run)
-        trainer, state = run.policy()
+        trainer, state = run.policy(best=not self.last)
         print("rolling out and rendering ...", flush=True)
+        if self.course:
+            from fmpjax import sim2sim
+
+            print(f"wrote {runs.course_video(run, trainer, state, sim2sim.course(self.course), self.out)}")
+            return
         played = Evaluator(trainer, 8).play(state.ppo)
         print(f"wrote {runs.video(run, trainer, played, seconds=self.seconds, path=self.out, alone=self.alone)}")
 

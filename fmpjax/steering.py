@@ -92,7 +92,8 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 256, each: int
     plane, aside = cells[: SPEEDS * TURNS], cells[SPEEDS * TURNS :]
     straight = [cell for cell in plane if cell.turn == 0 and cell.ahead > 0]
     still = np.flatnonzero((grid == 0).all(1))
-    way = np.linalg.norm(played.place[-1] - played.place[round(SETTLING * rate)], axis=-1) / (CONSTANT - SETTLING)
+    place = played.qpos[..., :2]
+    way = np.linalg.norm(place[-1] - place[round(SETTLING * rate)], axis=-1) / (CONSTANT - SETTLING)
     way = np.where(played.fell, np.nan, way).reshape(len(grid), each)
 
     legs = rng.uniform(low, high, (LEGS, episodes, 3))
@@ -131,7 +132,7 @@ class Played(NamedTuple):
     """Episodes of N environments over T steps; after a fall nothing moves."""
 
     velocity: np.ndarray  # [T, N, 3] in the heading frame: m/s, m/s, rad/s
-    place: np.ndarray  # [T, N, 2] m, of the root
+    qpos: np.ndarray  # [T, N, nq]
     alive: np.ndarray  # [T, N] bool
     fell: np.ndarray  # [N] bool
 
@@ -167,12 +168,11 @@ def _play(trainer: Trainer, state: PPOState, rows: jax.Array, told: jax.Array):
         told = obey(now.command, None, reached.observed.frame).state
         now = now._replace(physics=sim, observed=observed, disturbed=reached.disturbed, command=told)
         alive = alive & ~reached.fell
-        place = observed.frame[..., layout.root][..., :2]
-        return (now, alive), (velocity.heading_velocity(observed.frame, layout), place, alive)
+        return (now, alive), (velocity.heading_velocity(observed.frame, layout), sim.qpos, alive)
 
     drawn = env.disturbance_draws(jax.random.PRNGKey(0), len(told), len(rows))
-    (_, alive), (velocities, places, lives) = jax.lax.scan(step, (start, jnp.ones(len(rows), bool)), (told, drawn))
-    return velocities, places, lives, ~alive
+    (_, alive), (velocities, qpos, lives) = jax.lax.scan(step, (start, jnp.ones(len(rows), bool)), (told, drawn))
+    return velocities, qpos, lives, ~alive
 
 
 def _cells(grid: np.ndarray, reached: np.ndarray, fell: np.ndarray) -> list[Cell]:

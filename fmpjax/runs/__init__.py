@@ -4,7 +4,7 @@ from fmpjax.files import without_places, write
 from fmpjax.provenance import machine, provenance
 from fmpjax.runs.clock import End
 from fmpjax.runs.folder import Run, check_trainable, default_folder, default_preset, describe, load_motion
-from fmpjax.runs.outputs import export, finish, video, web
+from fmpjax.runs.outputs import course_video, export, finish, video, web
 from fmpjax.runs.served import Live
 from fmpjax.runs.training import train
 
@@ -13,6 +13,7 @@ __all__ = [
     "Live",
     "Run",
     "check_trainable",
+    "course_video",
     "default_folder",
     "default_preset",
     "describe",

@@ -3,24 +3,26 @@
 import json
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
-from fmpjax import deploy, diagnose, jsons, policy
+from fmpjax import deploy, diagnose, jsons, policy, steering
 from fmpjax.commands import velocity
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Episodes, table
 from fmpjax.files import without_places, write
 from fmpjax.logs import MetricsLog
 from fmpjax.runs.folder import Run
-from fmpjax.trainer import Trainer
+from fmpjax.trainer import Trainer, TrainState
 from fmpjax.viz import curves, render
 
 _EXPORTED = (
-    "metrics.csv evaluation.json steering.json robustness.json ranking-start.json ranking.json curves.png steering.png "
-    "robustness.png frames.png policy.mp4 policy.gif"
+    "metrics.csv evaluation.json steering.json following.json robustness.json ranking-start.json ranking.json "
+    "curves.png steering.png following.png robustness.png frames.png policy.mp4 policy.gif course.mp4"
 ).split()
 
 
@@ -179,6 +181,49 @@ def video(
     panes = len(shown)
     frames = render.grid(trainer.robot, list(shown.values()), list(shown), columns=panes, width=360 * panes, height=360)
     return render.write_video(path or run.folder / "policy.mp4", frames, fps=rate / stride)
+
+
+def course_video(
+    run: Run,
+    trainer: Trainer,
+    state: TrainState,
+    course: Sequence[tuple[float, tuple[float, float, float]]],
+    path: Path | None,
+) -> Path:
+    """The policy under a course of commanded velocities, which stand in the picture; the path written.
+
+    Args:
+      run: whose command is a velocity.
+      trainer: of the run.
+      state: of the policy.
+      course: seconds and velocity (m/s ahead, m/s to the left, rad/s to the left) of each leg.
+      path: of the video, ``RUN/course.mp4`` by default.
+
+    Raises:
+      UserError: the run's command is no velocity, or the file cannot be written.
+    """
+    if trainer.config.command.kind != "velocity":
+        raise UserError(f"the run's command.kind is {trainer.config.command.kind!r}: expected 'velocity' for a course")
+    rate, stride = trainer.config.control_rate, 2  # 25 pictures a second
+    told = np.concatenate([np.tile(command, (max(1, round(seconds * rate)), 1)) for seconds, command in course])
+    played = steering.play(trainer, state.ppo, told[:, None], np.random.default_rng(0))
+    # A stride swings the velocity: what is shown is a mean over half a second.
+    shown = uniform_filter1d(played.velocity[:, 0], round(0.5 * rate), axis=0, mode="nearest")
+    length = max(1, int(played.alive[:, 0].sum()))
+    labels = [_told(*pair, aside=bool(told[:, 1].any())) for pair in zip(told, shown, strict=True)]
+    frames = render.render_frames(
+        trainer.robot, played.qpos[:length:stride, 0], width=640, height=400, labels=labels[:length:stride]
+    )
+    return render.write_video(path or run.folder / "course.mp4", frames, fps=rate / stride)
+
+
+def _told(told: np.ndarray, does: np.ndarray, *, aside: bool) -> str:
+    """A commanded velocity and the robot's, each ``[3]``, in words; the part to the side where any is commanded."""
+    (ahead, left, turn), (ahead_now, left_now, turn_now) = told, does
+    if aside:
+        now = f"{ahead_now:.2f}, {left_now:+.2f}, {turn_now:+.2f}"
+        return f"told {ahead:.2f}, {left:+.2f} m/s, {turn:+.2f} rad/s   does {now}"
+    return f"told {ahead:.2f} m/s, {turn:+.2f} rad/s   does {ahead_now:.2f}, {turn_now:+.2f}"
 
 
 def _longest(played: Episodes) -> int:

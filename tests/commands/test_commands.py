@@ -358,6 +358,11 @@ def test_a_run_is_told_velocities_and_measured(told, capsys):
     found = json.loads((told / "steering.json").read_text())
     assert found["changing_episodes"] == 4 and len(found["cells"]) == steering.SPEEDS * steering.TURNS
     assert (told / "steering.png").stat().st_size > 10_000
+    cli.main(["render", str(told), "--course", "0.3:0.4,0,0.2", "0.2:0,0,0"])
+    assert (told / "course.mp4").exists() or (told / "course.gif").exists()
+    with pytest.raises(SystemExit):
+        cli.main(["render", str(told), "--course", "0.3:fast"])
+    assert "leg '0.3:fast' of the course: expected SECONDS:FORWARD,LEFT,TURN" in capsys.readouterr().err
 
 
 @pytest.mark.slow
