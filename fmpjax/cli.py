@@ -65,6 +65,8 @@ class Evaluate:
             raise UserError(f"--episodes is {self.episodes}: expected at least 1")
         run = runs.Run.open(self.run)
         trainer, state = run.policy(best=not self.last)
+        if sentence := steering.beyond(trainer):
+            print(f"note: {sentence}")
         print("compiling the episodes ...", flush=True)
         found = steering.measure(trainer, state.ppo, **({} if self.episodes is None else {"changing": self.episodes}))
         print(f"iteration {int(state.iteration):,}:\n{steering.table(found)}")

@@ -113,6 +113,14 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 4, changing: i
         changing_turn_error=_mean(off[:, 2]),
     )
 
+def beyond(trainer: Trainer) -> str | None:
+    """A sentence where the commands of `measure` reach beyond the velocities of the demonstrations; else None."""
+    config, library = trainer.config.command, trainer.env.library
+    if config.kind != "velocity":
+        return None
+    return velocity.beyond(velocity.corners(*velocity.extent(config, library)), library)
+
+
 
 class Played(NamedTuple):
     """Episodes of N environments over T steps; after a fall nothing moves."""
