@@ -58,7 +58,8 @@ render: run-is-named $(READY) ## render a run's policy as a video: RUN=runs/walk
 	$(BIN)/fmpjax render '$(RUN)' $(ARGS)
 
 # A file of tests at a time to each of two processes: most of the time is XLA's compiling, which uses one core.
-# Warp runs on a CPU too: its tests need it, training does without its 150 MB. The same holds for ONNX Runtime and viser.
+# Warp runs on a CPU too: its tests need it, training does without its 150 MB. The same holds for ONNX Runtime, viser and
+# the packages of the hub.
 test: $(READY) $(VENV)/.extras ## run every test, in WORKERS processes (2)
 	$(BIN)/python -m pytest -n $(or $(WORKERS),2) --dist loadfile $(or $(ARGS),-m 'not alone')
 	$(if $(ARGS),,$(BIN)/python -m pytest -m alone)
@@ -115,5 +116,5 @@ $(READY): pyproject.toml $(CONSTRAINTS)
 	@touch $@
 
 $(VENV)/.extras: $(READY)
-	@$(install) '.[warp,deploy,play]'
+	@$(install) '.[warp,deploy,play,hub]'
 	@touch $@

@@ -37,69 +37,63 @@ class Evaluate:
     def __call__(self) -> None:
         if self.commands and self.robust:
             raise UserError("--commands and --robust are two evaluations: expected one of them")
-        if self.commands:
-            return self._commands()
-        if self.robust:
-            return self._robust()
-        runs = runs_module()
-        from fmpjax.evaluate import Evaluator, table
-
         if self.episodes is not None and self.episodes < 1:
             raise UserError(f"--episodes is {self.episodes}: expected at least 1")
-        run = runs.Run.open(self.run)
+        run = runs_module().Run.open(self.run)
         trainer, state = run.policy(best=not self.last)
+        measure = self._commands if self.commands else self._robust if self.robust else self._first
+        measure(run, trainer, state)
+
+    def _first(self, run, trainer, state) -> None:
+        from fmpjax.evaluate import Evaluator, table
+
         print("compiling the evaluation ...", flush=True)
         evaluation = Evaluator(trainer, self.episodes)(state.ppo)
         print(f"iteration {int(state.iteration):,}:\n{table(evaluation)}")
-        name = "evaluation-last" if self.last else "evaluation"
-        run.save_evaluation(evaluation, name)
-        print(f"wrote {run.folder / name}.json")
+        path = self._file(run, "evaluation")
+        run.save_evaluation(evaluation, path.stem)
+        print(f"wrote {path}")
 
-    def _commands(self) -> None:
-        runs = runs_module()
+    def _commands(self, run, trainer, state) -> None:
         from fmpjax import following, steering
         from fmpjax.files import write
         from fmpjax.viz import along, heat
 
-        if self.episodes is not None and self.episodes < 1:
-            raise UserError(f"--episodes is {self.episodes}: expected at least 1")
-        run = runs.Run.open(self.run)
-        trainer, state = run.policy(best=not self.last)
+        if sentence := steering.beyond(trainer):
+            print(f"note: {sentence}")
         print("compiling the episodes ...", flush=True)
-        last = "-last" if self.last else ""
         changed = {} if self.episodes is None else {"episodes": self.episodes}
         if trainer.config.command.kind == "phase":
             followed = following.measure(trainer, state.ppo, **changed)
             print(f"iteration {int(state.iteration):,}:\n{following.table(followed)}")
-            path = run.folder / f"following{last}.json"
+            path = self._file(run, "following")
             write(path, followed.to_json())
             picture = along.draw(path.with_suffix(".png"), followed.seconds, following.curves(followed))
             print(f"wrote {path}\nwrote {picture}")
             return
         found = steering.measure(trainer, state.ppo, **changed)
         print(f"iteration {int(state.iteration):,}:\n{steering.table(found)}")
-        path = run.folder / f"steering{last}.json"
+        path = self._file(run, "steering")
         write(path, found.to_json())
         print(f"wrote {path}\nwrote {heat.draw(path.with_suffix('.png'), *steering.maps(found))}")
 
-    def _robust(self) -> None:
-        runs = runs_module()
+    def _robust(self, run, trainer, state) -> None:
         from fmpjax import robustness
         from fmpjax.files import write
         from fmpjax.viz import bars
 
-        if self.episodes is not None and self.episodes < 1:
-            raise UserError(f"--episodes is {self.episodes}: expected at least 1")
-        run = runs.Run.open(self.run)
-        trainer, state = run.policy(best=not self.last)
         episodes = self.episodes or robustness.EPISODES
         print(f"compiling the episodes, {episodes} of each case; each case takes seconds ...", flush=True)
         print(f"iteration {int(state.iteration):,}:\n{robustness.heading()}")
         found = robustness.measure(trainer, state.ppo, episodes=episodes, note=lambda line: print(line, flush=True))
-        path = run.folder / ("robustness-last.json" if self.last else "robustness.json")
+        path = self._file(run, "robustness")
         write(path, found.to_json())
         title = f"{run.folder.resolve().name}: first episodes of {found.seconds:g} s, {episodes} per bar"
         print(f"wrote {path}\nwrote {bars.draw(path.with_suffix('.png'), robustness.bars(found), title)}")
+
+    def _file(self, run, name: str) -> Path:
+        """The file of the run that holds figures of its best policy, or of its newest."""
+        return run.folder / f"{name}{'-last' if self.last else ''}.json"
 
 
 @dataclasses.dataclass(frozen=True)

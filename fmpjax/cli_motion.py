@@ -32,10 +32,15 @@ class Reading:
     """Words, as wrist,waist_roll: the file lacks the joints with one in their name, and they are zero."""
     degrees: bool = False
     """The file's joints are in degrees."""
+    accept_license: bool = False
+    """Accept the license of a Hugging Face data set without a question."""
 
-    def options(self) -> dict[str, Any]:
-        """What `fmpjax.motion.load` is told."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(Reading)}
+    def options(self, *files: str) -> dict[str, Any]:
+        """What `fmpjax.motion.load` is told; the licenses of ``files`` are accepted where that is asked for."""
+        if self.accept_license:
+            motion.accept_license(*files)
+        names = (field.name for field in dataclasses.fields(Reading) if field.name != "accept_license")
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,13 +48,13 @@ class Source(Reading):
     """A motion in a file."""
 
     file: tyro.conf.Positional[str]
-    """A motion file of any format, or a bundled motion's name."""
+    """A motion file of any format, by its path or address, or a bundled motion's name."""
 
     def clip(self) -> tuple[MotionClip, int]:
         """The clip at the file's own rate, and how often its quaternion flips in the file."""
         from fmpjax.motion import check, formats
 
-        file, recording = formats.record(self.file, **self.options())
+        file, recording = formats.record(self.file, **self.options(self.file))
         if len(recording.qpos) < formats.LEAST_SAMPLES:
             raise UserError(f"{file}: {len(recording.qpos)} frames, expected at least {formats.LEAST_SAMPLES}")
         clip = MotionClip.from_qpos(file.stem, robots.load(self.robot).name, recording.rate, recording.qpos)
@@ -62,7 +67,7 @@ class Import(Reading):
     """Read motions of any format and write them as this package's own."""
 
     files: tyro.conf.Positional[tuple[str, ...]]
-    """Motion files; several are written to the folder --out under their own names."""
+    """Motion files or addresses of some; several are written to the folder --out under their own names."""
     out: Path
     """File to write, .npz; a folder for several files."""
     rate: float = 50.0
@@ -81,7 +86,7 @@ class Import(Reading):
     """Write the files as one motion, each beginning where the one before has ended."""
 
     def __call__(self) -> None:
-        from fmpjax.motion import check, edit
+        from fmpjax.motion import addresses, check, edit
 
         if not self.files:
             raise UserError("no file to import: expected at least one")
@@ -90,13 +95,15 @@ class Import(Reading):
         if self.heading is not None and not math.isfinite(self.heading):
             raise UserError(f"--heading is {self.heading}: expected degrees")
         several = len(self.files) > 1 and not self.join
-        paths = [self.out / f"{Path(file).stem}.npz" if several else self.out for file in self.files]
+        paths = [
+            self.out / f"{Path(addresses.file_name(file)).stem}.npz" if several else self.out for file in self.files
+        ]
         if several and len(set(paths)) < len(paths):
             raise UserError("two of the files have the same name: import them one by one")
         robot = robots.load(self.robot)
-        clips, said = [], []
+        clips, said, options = [], [], self.options(*self.files)
         for file in self.files:
-            clip = motion.load(file, rate=self.rate, **self.options())
+            clip = motion.load(file, rate=self.rate, **options)
             said.append(f"{file} was read as\n{clip.reading}")
             if self.speed != 1:
                 before, clip = clip, edit.faster(clip, self.speed)
@@ -281,8 +288,8 @@ class Synthesize:
 class Retarget:
     """Put a human's motion capture (BVH, SMPL) on a robot by inverse kinematics; exit code 1 where that is broken."""
 
-    file: tyro.conf.Positional[Path]
-    """Motion capture: .bvh, or .npz with SMPL's parameters as AMASS writes them."""
+    file: tyro.conf.Positional[str]
+    """Motion capture, by its path or address: .bvh, or .npz with SMPL's parameters as AMASS writes them."""
     out: Path
     """File to write, .npz."""
     frames: Annotated[str | None, default("all")] = None
@@ -295,10 +302,14 @@ class Retarget:
     """The file's axis that is up, y or z; by default the one along which hips are over ankles."""
     body_model: Annotated[Path | None, default("none")] = None
     """The body model (.npz) that SMPL's parameters are for, from its makers."""
+    accept_license: bool = False
+    """Accept the license of a Hugging Face data set without a question."""
 
     def __call__(self) -> None:
         from fmpjax.motion import retarget
 
+        if self.accept_license:
+            motion.accept_license(self.file)
         said, broken = retarget.convert(
             self.file, robots.load(self.robot), self.out, self.frames,
             skeleton=self.skeleton, up=self.up, body_model=self.body_model,

@@ -57,10 +57,13 @@ class Train:
     robot: Annotated[str | None, _setting("robot")] = None
     """A robot under robots/."""
     motion: Annotated[str | None, _setting("motion")] = None
-    """A bundled motion's name, a file or a folder of files; several with weights as NAME[:WEIGHT],NAME[:WEIGHT]."""
+    """A bundled motion's name, a file, a folder of files or an address (https://, hf://); several with weights as
+    NAME[:WEIGHT],NAME[:WEIGHT]."""
     command: Annotated[str | None, default("none, or the run's own with --resume")] = None
     """What the policy is told: `none`, `velocity` (by default of the motions `gaits`), `phase`,
     or `motion` (one of several); docs/steering.md."""
+    accept_license: bool = False
+    """Accept the license of a Hugging Face data set without a question."""
     frames: Annotated[str | None, default("all")] = None
     """Source rows first:last of the motion, 0-based, both included; of several motions with commas between them."""
     seed: Annotated[int | None, _setting("seed")] = None
@@ -202,6 +205,8 @@ class Train:
         folder = self.run or runs.default_folder(config)
         if self.seeds is None:
             return [runs.Run.create(folder, config)]
+        if self.accept_license:
+            library.accept_license(config.motion)
         seeds = range(config.seed, config.seed + self.seeds)
         configs = [configuration.validate(dataclasses.replace(config, seed=seed)) for seed in seeds]
         return [runs.Run.create(folder / f"seed{each.seed}", each) for each in configs]

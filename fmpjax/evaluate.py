@@ -11,8 +11,7 @@ import numpy as np
 from ott.geometry import geometry
 from ott.tools import sinkhorn_divergence
 
-from fmpjax import features, jsons, kinematics, metrics, rotations, tables, transport
-from fmpjax.acting import of_actor
+from fmpjax import features, frozen, jsons, kinematics, metrics, rotations, tables, transport
 from fmpjax.config import Config, FeatureConfig
 from fmpjax.env import EnvState
 from fmpjax.motion import MotionClip
@@ -182,25 +181,12 @@ class Evaluator:
 
         def step(carry, drawn):
             now, alive, fell, length = carry
-            now, seen = env.look(now, drawn)
-            with self.trainer.precision():
-                action, _ = policy.act(of_actor(seen), None)
-            reached = env.advance(now.physics, action, now.disturbed, drawn)
-            fell, length = fell | (alive & reached.fell), length + alive
-            still_alive = alive & ~reached.fell
-            now = now._replace(disturbed=reached.disturbed)
-            if env.command:  # it stays what it was at the start, and may end the episode
-                command, over, _ = env.command.advance(now.command, None, reached.observed.frame)
-                now, still_alive = now._replace(command=command), still_alive & ~over
-
-            def hold(new, old):
-                # The step on which a robot falls is part of its episode; after it nothing moves.
-                return jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-            sim = jax.tree.map(hold, reached.physics, now.physics)
-            observed = jax.tree.map(hold, reached.observed, now.observed)
-            now = now._replace(physics=sim, observed=observed)
-            return (now, still_alive, fell, length), (sim.qpos[:headline], sim.qvel[:headline])
+            taken = frozen.step(self.trainer, env, policy, now, alive, drawn)
+            sim = taken.now.physics
+            return (taken.now, taken.alive, fell | taken.fell, length + alive), (
+                sim.qpos[:headline],
+                sim.qvel[:headline],
+            )
 
         alive = jnp.ones(len(self.rows), bool)
         (_, _, fell, length), (qpos, qvel) = jax.lax.scan(

@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import jsons, metrics, tables
-from fmpjax.acting import of_actor
+from fmpjax import frozen, jsons, metrics, tables
 from fmpjax.errors import UserError
 from fmpjax.frames import FrameLayout
 from fmpjax.ppo import PPOState
@@ -82,25 +81,17 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 128) -> Follow
 @partial(jax.jit, static_argnums=(0, 3))
 def _play(trainer: Trainer, state: PPOState, rows: jax.Array, steps: int):
     env = trainer.env
-    assert env.command is not None
-    obey = env.command.advance
     policy, start = trainer.ppo.act(state, deterministic=True), env.undisturbed(env.start_at(rows))
 
     def step(carry, drawn):
         now, alive, fell = carry
-        now, seen = env.look(now, drawn)
-        with trainer.precision():
-            action, _ = policy.act(of_actor(seen), None)
-        reached = env.advance(now.physics, action, now.disturbed, drawn)
-        command, over, _ = obey(now.command, None, reached.observed.frame)
-
-        def hold(new, old):
-            return jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-        sim, observed = jax.tree.map(hold, (reached.physics, reached.observed), (now.physics, now.observed))
-        now = now._replace(physics=sim, observed=observed, disturbed=reached.disturbed, command=command)
-        fell = fell | (alive & reached.fell)
-        return (now, alive & ~reached.fell & ~over, fell), (sim.qpos, _points(trainer, observed.frame), alive)
+        taken = frozen.step(trainer, env, policy, now, alive, drawn)
+        reached = taken.now
+        return (reached, taken.alive, fell | taken.fell), (
+            reached.physics.qpos,
+            _points(trainer, reached.observed.frame),
+            alive,
+        )
 
     drawn = env.disturbance_draws(jax.random.PRNGKey(0), steps, len(rows))
     alive = jnp.ones(len(rows), bool)

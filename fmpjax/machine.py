@@ -38,6 +38,15 @@ def memory() -> int | None:
     return min((size for size in found if size > 0), default=None)
 
 
+def cache_folder(name: str) -> Path:
+    """A folder of the package in the user's cache folder, which may not exist yet.
+
+    Raises:
+      RuntimeError: there is no home folder.
+    """
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fmpjax" / name
+
+
 def keep_compiled() -> None:
     """Have JAX keep compiled programs in the user's cache folder, 1 GiB at most, so that a second run starts at once.
 
@@ -49,8 +58,7 @@ def keep_compiled() -> None:
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     try:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        folder = base / "fmpjax" / "compiled" / hashlib.sha256(_processor().encode()).hexdigest()[:12]
+        folder = cache_folder("compiled") / hashlib.sha256(_processor().encode()).hexdigest()[:12]
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # without a home, or with one that cannot be written, nothing is kept
         return

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import jsons, metrics, physics, rotations, tables
-from fmpjax.acting import of_actor
+from fmpjax import frozen, jsons, metrics, physics, rotations, tables
 from fmpjax.config import Config, DisturbanceConfig
 from fmpjax.env import Env, EnvState
 from fmpjax.evaluate import episodes_of, planar_speed
@@ -179,27 +178,9 @@ class Player:
         env, policy = self.env, self.trainer.ppo.act(state, deterministic=True)
 
         def step(carry, drawn):
-            now, seen = env.look(carry.now, drawn)
-            with self.trainer.precision():
-                action, _ = policy.act(of_actor(seen), None)
-            reached, alive = env.advance(now.physics, action, now.disturbed, drawn), carry.alive
-            now, going_on = now._replace(disturbed=reached.disturbed), alive & ~reached.fell
-            if env.command:  # it stays what it was at the start, and may end the episode
-                command, over, _ = env.command.advance(now.command, None, reached.observed.frame)
-                now, going_on = now._replace(command=command), going_on & ~over
-
-            def hold(new, old):
-                return jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-            sim = jax.tree.map(hold, reached.physics, now.physics)
-            observed = jax.tree.map(hold, reached.observed, now.observed)
-            after = _Second(
-                now._replace(physics=sim, observed=observed),
-                going_on,
-                carry.fell | (alive & reached.fell),
-                carry.length + alive,
-            )
-            return after, sim.qpos
+            taken = frozen.step(self.trainer, env, policy, carry.now, carry.alive, drawn)
+            after = _Second(taken.now, taken.alive, carry.fell | taken.fell, carry.length + carry.alive)
+            return after, taken.now.physics.qpos
 
         return jax.lax.scan(step, under_way, env.disturbance_draws(key, self.chunk, self.count))
 

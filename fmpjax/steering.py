@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import jsons, tables
-from fmpjax.acting import of_actor
+from fmpjax import frozen, jsons, tables
 from fmpjax.commands import velocity
 from fmpjax.errors import UserError
 from fmpjax.frames import FrameLayout
@@ -128,6 +127,14 @@ def _grid(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return np.array([(v, 0.0, w) for v in speeds for w in turns] + [(0.0, side, 0.0) for side in sides])
 
 
+def beyond(trainer: Trainer) -> str | None:
+    """A sentence where the commands of `measure` reach beyond the velocities of the demonstrations; else None."""
+    config, library = trainer.config.command, trainer.env.library
+    if config.kind != "velocity":
+        return None
+    return velocity.beyond(velocity.corners(*velocity.extent(config, library)), library)
+
+
 class Played(NamedTuple):
     """Episodes of N environments over T steps; after a fall nothing moves."""
 
@@ -150,25 +157,18 @@ def play(trainer: Trainer, state: PPOState, told: np.ndarray, rng: np.random.Gen
 @partial(jax.jit, static_argnums=0)
 def _play(trainer: Trainer, state: PPOState, rows: jax.Array, told: jax.Array):
     env, layout = trainer.env, FrameLayout.of(trainer.robot)
-    assert env.command is not None
-    obey = env.command.advance
     policy, start = trainer.ppo.act(state, deterministic=True), env.undisturbed(env.start_at(rows))
 
     def step(carry, inputs):
         (now, alive), (command, drawn) = carry, inputs
-        now, seen = env.look(now._replace(command=now.command._replace(value=command)), drawn)
-        with trainer.precision():
-            action, _ = policy.act(of_actor(seen), None)
-        reached = env.advance(now.physics, action, now.disturbed, drawn)
-
-        def hold(new, old):
-            return jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-        sim, observed = jax.tree.map(hold, (reached.physics, reached.observed), (now.physics, now.observed))
-        told = obey(now.command, None, reached.observed.frame).state
-        now = now._replace(physics=sim, observed=observed, disturbed=reached.disturbed, command=told)
-        alive = alive & ~reached.fell
-        return (now, alive), (velocity.heading_velocity(observed.frame, layout), sim.qpos, alive)
+        now = now._replace(command=now.command._replace(value=command))
+        taken = frozen.step(trainer, env, policy, now, alive, drawn)
+        reached = taken.now
+        return (reached, taken.alive), (
+            velocity.heading_velocity(reached.observed.frame, layout),
+            reached.physics.qpos,
+            taken.alive,
+        )
 
     drawn = env.disturbance_draws(jax.random.PRNGKey(0), len(told), len(rows))
     (_, alive), (velocities, qpos, lives) = jax.lax.scan(step, (start, jnp.ones(len(rows), bool)), (told, drawn))

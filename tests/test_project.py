@@ -14,8 +14,8 @@ from fmpjax import transport
 from tests.helpers import ROOT
 
 IMPORTED_AS = {
-    "imageio-ffmpeg": "imageio_ffmpeg", "mujoco-mjx": "mujoco", "orbax-checkpoint": "orbax", "ott-jax": "ott",
-    "pillow": "PIL",
+    "huggingface-hub": "huggingface_hub", "imageio-ffmpeg": "imageio_ffmpeg", "mujoco-mjx": "mujoco",
+    "orbax-checkpoint": "orbax", "ott-jax": "ott", "pillow": "PIL",
 }  # fmt: skip
 USED_BY_OTHERS = {"filelock"}  # JAX imports it where it bounds the folder of compiled programs
 
@@ -31,7 +31,7 @@ def test_every_requirement_is_imported_and_pinned():
     optional = project["optional-dependencies"]
     for requirement in [
         *project["dependencies"],
-        *(r for extra in ("viz", "retarget", "deploy", "play") for r in optional[extra]),
+        *(r for extra in ("viz", "retarget", "deploy", "play", "hub") for r in optional[extra]),
     ]:
         name = _name(requirement)
         module = IMPORTED_AS.get(name, re.match(r"[A-Za-z0-9-]+", requirement)[0])

@@ -1,10 +1,12 @@
 """A commanded velocity in the heading frame: ahead, to the left, turning to the left."""
 
+import itertools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import nnls
 
 from fmpjax import rotations
 from fmpjax.commands.base import Command, Told
@@ -14,6 +16,7 @@ from fmpjax.motion import MotionClip, MotionLibrary
 from fmpjax.robots import Robot
 
 AVERAGED = 1.0  # s, over which a demonstration's own velocity is its mean: about one stride
+TOLERANCE = 0.1  # m/s and rad/s together, by which a command may be beyond the demonstrations before it is worth a line
 
 
 class Velocity(NamedTuple):
@@ -95,6 +98,48 @@ def extent(config: CommandConfig, library: MotionLibrary) -> np.ndarray:
     own = np.stack([velocities(clip).mean(0) for clip in library.clips]).round(2)
     spans = own if config.ranges is None else np.transpose(config.ranges)
     return np.stack([np.minimum(spans.min(0), 0.0), np.maximum(spans.max(0), 0.0)])
+
+
+def corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The eight commands ``[8, 3]`` at the ends of ranges ``[3]`` (m/s, m/s, rad/s)."""
+    return np.array(list(itertools.product(*zip(low, high, strict=True))))
+
+
+def told(config: CommandConfig) -> np.ndarray:
+    """The commands ``[C, 3]`` furthest out that a training gives beside the demonstrations' own and those between."""
+    ends = np.zeros((0, 3)) if config.ranges is None else corners(*np.transpose(config.ranges))
+    return np.concatenate([ends, np.zeros((int(config.zero > 0), 3))])
+
+
+def beyond(commands: np.ndarray, library: MotionLibrary) -> str | None:
+    """A sentence where one of ``commands [C, 3]`` (m/s, m/s, rad/s) is neither a motion's nor between some; else None.
+
+    Of the demonstrations count the mean velocities over one second about each sample, and all means of these.
+    """
+    own = [velocities(clip) for clip in library.clips]
+    rows = np.unique(np.concatenate(own).round(2), axis=0)
+    off = np.array([_distance(command, rows) for command in commands])
+    if off.max(initial=0.0) <= TOLERANCE:
+        return None
+    command = commands[off.argmax()]
+    nearest = [each[np.linalg.norm(each - command, axis=1).argmin()] for each in own]
+    best = int(np.linalg.norm(np.array(nearest) - command, axis=1).argmin())
+    return (
+        f"commands reach {_said(command)}, beyond what the motions show: the nearest motion, "
+        f"{library.clips[best].name}, moves at {_said(nearest[best])}"
+    )
+
+
+def _distance(command: np.ndarray, rows: np.ndarray) -> float:
+    """Distance of a command ``[3]`` to the nearest mean, by any weights, of ``rows [M, 3]``."""
+    heavy = 1e4  # so that the weights sum to one
+    weights, _ = nnls(np.concatenate([rows.T, np.full((1, len(rows)), heavy)]), np.append(command, heavy))
+    return float(np.linalg.norm(weights @ rows - command))
+
+
+def _said(velocity: np.ndarray) -> str:
+    ahead, left, turn = velocity.round(2) + 0.0  # no -0.00
+    return f"{ahead:.2f} m/s ahead, {left:.2f} m/s and {turn:.2f} rad/s to the left"
 
 
 def heading_velocity(frame: jax.Array, layout: FrameLayout) -> jax.Array:

@@ -311,7 +311,8 @@ class Config(Section):
 
     method: str = "fmp"  # motion prior, as `fmpjax list` names it [P]
     robot: str = "unitree_g1_29dof"  # folder under robots/ [M]
-    motion: str = "walk"  # a bundled motion's name or a file; several as NAME[:WEIGHT],NAME[:WEIGHT] [D]
+    # a bundled motion's name, a file or its address (https://, hf://); several as NAME[:WEIGHT],NAME[:WEIGHT] [D]
+    motion: str = "walk"
     frames: str = ""  # source rows "first:last" of the motion, both included; empty for all [D]
     preset: str = "paper"  # preset that the other settings depart from
     seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 0  # of everything that is random [D]

@@ -1,12 +1,12 @@
 """The card for the people who run a policy."""
 
-from pathlib import Path
 from typing import Any
 
 import fmpjax
 from fmpjax import features, resources, tables
 from fmpjax.deploy.origin import Origin
 from fmpjax.errors import UserError
+from fmpjax.motion import addresses
 from fmpjax.motion.formats import locate
 from fmpjax.policy import Policy
 from fmpjax.robots import Robot
@@ -134,7 +134,9 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
         transitions=config.transitions,
         reset=config.env.reset,
         physics_rate=1.0 / config.physics.timestep,
-        motions="\n".join(tables.row((Path(name).name, f"{w:g}", _license(name, robot))) for name, w in origin.motions),
+        motions="\n".join(
+            tables.row((addresses.file_name(name), f"{w:g}", _license(name, robot))) for name, w in origin.motions
+        ),
         evaluation=_evaluated(origin.evaluation),
         robustness=_robustness(origin.evaluation, origin.robustness),
         steering=_steering(origin.steering),
@@ -149,6 +151,10 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
 
 
 def _license(name: str, robot: Robot) -> str:
+    if license := addresses.license_of(name):
+        return f"{license}, as its data set's card says"
+    if addresses.is_address(name):
+        return "unknown: ask the motion's source"
     try:
         shipped = locate(name, robot.name).is_relative_to(resources.folder("motions"))
     except UserError:  # the file is no longer where it was

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 import fmpjax
 from fmpjax import features, sim2sim
 from fmpjax.deploy.origin import Origin
+from fmpjax.motion import addresses
 from fmpjax.policy import Policy
 from fmpjax.robots import Robot
 
@@ -68,7 +68,7 @@ def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
         "total_mass": str(robot.total_mass),
         "robot": robot.name,
         "method": origin.config.method,
-        "motions": _list(Path(name).name for name, _ in origin.motions),
+        "motions": _list(addresses.file_name(name) for name, _ in origin.motions),
         "commit": origin.version,
         "fmpjax_version": fmpjax.__version__,
     }

@@ -14,7 +14,7 @@ import numpy as np
 
 from fmpjax import resources, robots
 from fmpjax.errors import UserError
-from fmpjax.motion import edit, readers
+from fmpjax.motion import addresses, edit, readers
 from fmpjax.motion.clip import Fact, MotionClip, resample, sample_count
 from fmpjax.motion.readers.recording import MOST_SAMPLES, ORDERS, Options, Recording, plain_name
 
@@ -49,8 +49,8 @@ def load(
     A file that says that it loops is repeated until it lasts `LOOPED` s, unless ``frames`` takes a part of it.
 
     Args:
-      path: a file of any format of `fmpjax.motion.readers`, or the name of a bundled motion such as ``"walk"``,
-        which is each robot's own.
+      path: a file of any format of `fmpjax.motion.readers`, its address (`fmpjax.motion.addresses`), or the name of a
+        bundled motion such as ``"walk"``, which is each robot's own.
       fps: rate of the source rows, Hz; replaces the file's own.
       frames: source rows to use, 0-based, both ends included: ``(2370, 2580)``, ``"2370:2580"``, ``"100:"``.
       rate: rate of the clip, Hz.
@@ -182,7 +182,12 @@ def save(clip: MotionClip, path: str | os.PathLike) -> Path:
 
 
 def locate(path: str | os.PathLike, robot: str = "unitree_g1") -> Path:
-    """The file that ``path`` names: a bundled motion's, of the robot where it has one of that name, or its own."""
+    """The file that ``path`` names: a bundled motion's, of the robot where it has one of that name, or its own.
+
+    The file at an address is fetched first.
+    """
+    if addresses.is_address(path):
+        return addresses.fetch(str(path))
     file = Path(path)
     for name in (f"{robot}_{path}", str(path)):
         if (shipped := resources.folder("motions") / f"{name}.npz").is_file() and not file.is_absolute():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import glob
+import itertools
 import math
 import os
 from functools import cached_property
@@ -11,6 +12,7 @@ import numpy as np
 
 from fmpjax import resources
 from fmpjax.errors import UserError
+from fmpjax.motion import addresses
 from fmpjax.motion.clip import MotionClip
 from fmpjax.motion.formats import load
 
@@ -89,7 +91,7 @@ def load_library(
     """The clips that a list such as ``"walk,turn_left:0.5,mine.npz:2"`` names, each with its weight (1 by default).
 
     Args:
-      names: motions as `fmpjax.motion.load` takes them, with commas between them.
+      names: motions as `fmpjax.motion.load` takes them, addresses too, with commas between them.
       frames: source rows "first:last" of the only clip, or of each, with commas between them.
       rate: rate of the clips, Hz.
       robot: name of the robot that they must be for.
@@ -111,15 +113,15 @@ def load_library(
 
 def title(name: str) -> str:
     """A motion's name without its folder and the ending of a file."""
-    path = Path(name)
+    path = Path(addresses.file_name(name) or name) if addresses.is_address(name) else Path(name)
     return path.stem if path.suffix in SUFFIXES else path.name
 
 
 def listed(names: str) -> str:
     """A list of motions in which folders and patterns are replaced by the motion files that they stand for.
 
-    A folder is one's own or a shipped one; a pattern has a ``*``, ``?`` or ``[]``, ``**`` for folders in folders. Its
-    files share its weight evenly.
+    A folder is one's own, a shipped one or one of a data set's on the Hugging Face hub; a pattern has a ``*``, ``?`` or
+    ``[]``, ``**`` for folders in folders. Its files share its weight evenly.
 
     Raises:
       UserError: a folder holds no motion files, no file fits a pattern, a file's name has a comma, or `parse` refuses
@@ -150,6 +152,8 @@ def briefly(names: str) -> str:
 
 def _files(name: str) -> list[str] | None:
     """The motion files that a folder or a pattern stands for; None for the name of one motion."""
+    if addresses.is_address(name):
+        return addresses.listed(name, SUFFIXES)
     shipped = resources.folder("motions") / name
     folder = next((path for path in (Path(name), shipped) if path.is_dir()), None)
     if folder is not None:
@@ -165,6 +169,17 @@ def _files(name: str) -> list[str] | None:
     if not matches:
         raise UserError(f"no file fits the pattern {name!r}: expected motion files, such as 'clips/*.npz'")
     return matches
+
+
+def accept_license(*names: str) -> None:
+    """Accept, without a question, the licenses of the data sets in lists of motions, and print them.
+
+    Raises:
+      UserError: the hub cannot be reached, or `parse` refuses a list.
+    """
+    for name, _ in itertools.chain.from_iterable(map(parse, names)):
+        if addresses.is_address(name):
+            addresses.check_license(name, accept=True)
 
 
 def describe(name: str) -> str:
@@ -188,7 +203,8 @@ def parse(names: str) -> list[tuple[str, float]]:
     entries = []
     for entry in names.split(","):
         name, colon, text = entry.strip().rpartition(":")
-        if not colon or os.path.isfile(entry.strip()):
+        # A colon before a slash is one of an address.
+        if not colon or os.path.isfile(entry.strip()) or (addresses.is_address(entry.strip()) and "/" in text):
             name, text = entry.strip(), "1"
         try:
             weight = float(text)

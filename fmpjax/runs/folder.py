@@ -11,6 +11,7 @@ import jax
 from fmpjax import config as configuration
 from fmpjax import jsons, memory, motion, priors, robots
 from fmpjax.checkpoint import Checkpoints
+from fmpjax.commands import velocity
 from fmpjax.config import Config
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Evaluation, Evaluator
@@ -50,13 +51,17 @@ def load_motion(config: Config) -> motion.MotionLibrary:
 
 def describe(config: Config) -> str:
     """What the motions of a configuration were read as, and whether they are fit to learn from with its settings."""
-    return summary(
+    library = load_motion(config)
+    said = summary(
         robots.load(config.robot),
-        load_motion(config),
+        library,
         axes=config.features.axes,
         reset=config.env.reset,
         seconds=config.env.episode_steps / config.control_rate,
     )
+    if config.command.kind == "velocity" and (far := velocity.beyond(velocity.told(config.command), library)):
+        said += f"\n  warning: {far}"
+    return said
 
 
 class Run:

@@ -16,6 +16,7 @@ from fmpjax.errors import UserError
 from fmpjax.evaluate import Episodes, table
 from fmpjax.files import without_places, write
 from fmpjax.logs import MetricsLog
+from fmpjax.motion import addresses
 from fmpjax.runs.folder import Run
 from fmpjax.trainer import Trainer, TrainState
 from fmpjax.viz import curves, render
@@ -77,8 +78,9 @@ def export(run: Run, out: Path, *, onnx: bool = False) -> list[Path]:
         _check_deployable(run, "--onnx")
     if out.resolve() == run.folder.resolve():
         raise UserError(f"{out} is the run itself: expected another folder")
-    # Where the demonstration and the run lay is this machine's affair; their names are everybody's.
-    places = [*(name for name, _ in run.motions(run.config)), run.folder.resolve(), run.folder]
+    # Where the demonstration and the run lay is this machine's affair; their names and addresses are everybody's.
+    names = (name for name, _ in run.motions(run.config) if not addresses.shareable(name))
+    places = [*names, run.folder.resolve(), run.folder]
     texts = {"config.json": (run.folder / "config.json").read_text().rstrip("\n")}
     texts["provenance.json"] = jsons.dumps(run.provenance())
     texts = {n: without_places(text, places) for n, text in texts.items()}

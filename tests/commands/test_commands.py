@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -73,6 +74,42 @@ def test_commands_from_ranges(robot, slow_and_left):
     value = np.asarray(velocity.make(settings, RATE, robot, slow_and_left).draw(jax.random.PRNGKey(0), (5000,)).value)
     np.testing.assert_allclose([value.min(0), value.max(0)], [[-0.5, 0, 0.1], [1.5, 0, 0.3]], atol=0.01)
     np.testing.assert_allclose(velocity.extent(settings, slow_and_left), [[-0.5, 0, 0], [1.5, 0, 0.3]])
+
+
+def test_commands_that_no_motion_covers_are_told(robot, slow_and_left):
+    """A command of a motion, between two or near them is covered; of another one the nearest motion is named."""
+    slow, left = slow_and_left.clips
+    named = MotionLibrary((dataclasses.replace(slow, name="slow"), dataclasses.replace(left, name="left")), (0.5, 0.5))
+    covered = np.array([[0.4, 0, 0], [0.7, 0, 0.25], [1.0, 0, 0.5], [1.05, 0, 0.55]])
+    assert velocity.beyond(covered, named) is None and velocity.beyond(np.zeros((0, 3)), named) is None
+    assert velocity.beyond(np.array([[0.7, 0.0, 0.25], [1.6, -0.2, 0.5], [1.2, 0, 0.5]]), named) == (
+        "commands reach 1.60 m/s ahead, -0.20 m/s and 0.50 rad/s to the left, beyond what the motions show: "
+        "the nearest motion, left, moves at 1.00 m/s ahead, 0.00 m/s and 0.50 rad/s to the left"
+    )
+    # Both ends are motions', and their box has corners that are none's.
+    box = velocity.corners(np.array([0.4, 0, 0]), np.array([1.0, 0, 0.6]))
+    assert "commands reach 0.40 m/s ahead, 0.00 m/s and 0.60 rad/s to the left" in velocity.beyond(box, named)
+
+
+def test_the_commands_furthest_out_of_a_training():
+    own = CommandConfig(kind="velocity", zero=0.0)
+    assert velocity.told(own).shape == (0, 3)
+    np.testing.assert_array_equal(velocity.told(dataclasses.replace(own, zero=0.1)), [[0, 0, 0]])
+    ranged = velocity.told(dataclasses.replace(own, ahead=(-0.5, 1.5), turn=(0.1, 0.3)))
+    ends = [[-0.5, 0, 0.1], [-0.5, 0, 0.3], [1.5, 0, 0.1], [1.5, 0, 0.3]]
+    np.testing.assert_array_equal(np.unique(ranged, axis=0), ends)
+
+
+def test_a_training_and_an_evaluation_warn_of_commands_that_no_motion_covers():
+    asked = {"motion": "walk", "command.kind": "velocity", "command.zero": 0.0, "env.axes": "heading"}
+    assert "commands reach" not in runs.describe(preset("smoke", **asked))
+    far = preset("smoke", **asked, **{"command.ahead": (0.0, 2.0)})
+    (line,) = [line for line in runs.describe(far).splitlines() if "commands reach" in line]
+    assert line.startswith("  warning: commands reach 2.00 m/s ahead") and "the nearest motion, walk, moves at " in line
+    trainer = SimpleNamespace(config=far, env=SimpleNamespace(library=motion.load_library("walk")))
+    assert steering.beyond(trainer).startswith("commands reach 2.00 m/s ahead")
+    trainer.config = preset("smoke")
+    assert steering.beyond(trainer) is None
 
 
 def test_a_command_is_held_and_then_another(robot, slow_and_left):

@@ -7,7 +7,7 @@ import numpy as np
 
 from fmpjax import rotations
 from fmpjax.errors import UserError
-from fmpjax.motion import bvh, readers
+from fmpjax.motion import addresses, bvh, readers
 from fmpjax.motion.clip import Fact, Reading
 from fmpjax.motion.formats import cut, save, span
 from fmpjax.motion.readers import smpl
@@ -62,6 +62,10 @@ def convert(
     """Retarget the ``file``, or its ``frames`` FIRST:LAST, and write the clip as ``out``.
 
     Args:
+      file: motion capture, by its path or its address.
+      robot: that it is put on.
+      out: file to write, ``.npz``.
+      frames: those to take; all for None.
       skeleton: a TOML file that names the skeleton's joint of each part, such as ``left_hip = "LThigh"``.
       up: the file's axis that is up, "y" or "z".
       body_model: the body model of a file with SMPL's parameters.
@@ -70,11 +74,11 @@ def convert(
       What was read and how it fits, and whether the result is broken. A broken one is written as well.
 
     Raises:
-      UserError: see `read`, `formats.cut`, `retarget` and `fmpjax.motion.save`.
+      UserError: see `addresses.fetch`, `read`, `formats.cut`, `retarget` and `fmpjax.motion.save`.
     """
-    file = Path(file)
     if up not in (None, *AXES):
         raise UserError(f"--up is {up!r}, expected one of {', '.join(AXES)}")
+    file = addresses.local(file)
     source = read(file, None if body_model is None else Path(body_model))
     names = None if skeleton is None else read_skeleton(skeleton)
     count, said = len(source.values), []
