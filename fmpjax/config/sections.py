@@ -224,7 +224,7 @@ class PWILConfig(Section):
 
     scale: PositiveFloat = 5.0  # alpha, the reward of a perfect step [L]
     decay: PositiveFloat = 5.0  # beta, of the reward with the distance [L]
-    slack: NonNegativeFloat = 1e-6  # mass that a step lacks of 1 / T, so that the demonstration's never runs out [L]
+    slack: NonNegativeFloat = 1e-6  # by how much the mass of a step is below 1 / T; the demonstration lasts [L]
 
 
 # Transformer layers, heads, numbers per head.
@@ -311,7 +311,7 @@ class Config(Section):
 
     method: str = "fmp"  # motion prior, as `fmpjax list` names it [P]
     robot: str = "unitree_g1_29dof"  # folder under robots/ [M]
-    motion: str = "walk"  # a bundled motion's name or a file; several as NAME[:WEIGHT],NAME[:WEIGHT] [D]
+    motion: str = "walk"  # a bundled motion's name or a file; several with commas between, weights as NAME:WEIGHT [D]
     frames: str = ""  # source rows "first:last" of the motion, both included; empty for all [D]
     preset: str = "paper"  # preset that the other settings depart from
     seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 0  # of everything that is random [D]
