@@ -33,6 +33,7 @@ known_test := WORKERS ARGS
 known_test-fast := ARGS CONSTRAINTS
 known_test-oldest := ARGS
 known_coverage := ARGS
+known_docs := ARGS
 goals := $(or $(MAKECMDGOALS),$(.DEFAULT_GOAL))
 known := $(foreach goal,$(goals),$(known_$(goal))) PYTHON UV VENV
 given := $(foreach name,$(.VARIABLES),$(if $(filter command,$(firstword $(origin $(name)))),$(name)))
@@ -46,7 +47,7 @@ ifneq ($(unknown),)
   $(error unknown variable $(unknown)$(if $(close),$(comma) perhaps $(close)): make $(goals) takes $(strip $(known))$(hint))
 endif
 
-.PHONY: train evaluate render test test-fast test-oldest coverage check format build clean help run-is-named
+.PHONY: train evaluate render test test-fast test-oldest coverage check docs format build clean help run-is-named
 
 train: $(READY) ## train a policy: METHOD RESET PRESET ROBOT MOTION COMMAND FRAMES SEED SEEDS RUN MINUTES RESUME=1
 	$(BIN)/fmpjax train $(train_options)
@@ -76,6 +77,10 @@ check: $(READY) ## lint, and check the formatting, the arrows between modules an
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/ty check --no-progress --python $(VENV)
 
+# Links are checked, a warning is an error, and nothing is fetched.
+docs: $(READY) $(VENV)/.docs ## build the documentation site into site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet $(ARGS)
+
 coverage: $(READY) ## the share of the lines that the fast tests run, file by file
 	$(BIN)/python -m pytest -m 'not slow' --cov fmpjax --cov-report term:skip-covered $(ARGS)
 
@@ -87,7 +92,7 @@ build: $(READY) ## build the source archive and the wheel into dist/
 	$(BIN)/python -m build
 
 clean: ## remove the environment, caches and builds; runs/ stays
-	rm -rf $(VENV) .venv-oldest build dist .coverage .hypothesis .import_linter_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) .venv-oldest build dist site .coverage .hypothesis .import_linter_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help: ## show this list
@@ -117,4 +122,8 @@ $(READY): pyproject.toml $(CONSTRAINTS)
 
 $(VENV)/.extras: $(READY)
 	@$(install) '.[warp,deploy,play,hub]'
+	@touch $@
+
+$(VENV)/.docs: $(READY)
+	@$(install) '.[docs]'
 	@touch $@

@@ -112,5 +112,5 @@ class Checkpoints:
                 saved = manager.restore(step, args=ocp.args.StandardRestore())
         except Exception as error:  # orbax and tensorstore raise many kinds for a damaged folder
             cause = str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__
-            raise UserError(f"checkpoint {folder} cannot be read ({cause}): expected a whole checkpoint") from None
+            raise UserError(f"checkpoint {folder} cannot be read ({cause}): expected a complete checkpoint") from None
         return folder, saved

@@ -28,7 +28,7 @@ class Evaluate:
     episodes: Annotated[int | None, default("the run's evaluation_episodes")] = None
     """First episodes at the smallest perturbation, by which a run is judged; docs/metrics.md."""
     last: bool = False
-    """Take the newest checkpoint in place of the best."""
+    """Take the newest checkpoint instead of the best."""
     commands: bool = False
     """Measure how well a policy obeys the velocities, or follows the clip's time, that it is told; docs/steering.md."""
     robust: bool = False
@@ -103,13 +103,13 @@ class Render:
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     seconds: float = 10.0
-    """Length at most."""
+    """Greatest length."""
     last: bool = False
-    """Take the newest checkpoint in place of the best."""
+    """Take the newest checkpoint instead of the best."""
     out: Annotated[Path | None, default("RUN/policy.mp4")] = None
     """File to write; .gif where no encoder is installed."""
     alone: bool = False
-    """Leave the demonstration out, whose licence may not let a picture of it be passed on."""
+    """Leave the demonstration out; its license may forbid sharing pictures of it."""
     course: Annotated[tuple[str, ...], default("none")] = ()
     """Of a policy that is told velocities: commands as 4:0.5,0,0.4, seconds, ahead and left (m/s), turning (rad/s)."""
 
@@ -142,7 +142,7 @@ class Export:
     onnx: bool = False
     """Write policy.onnx and MODEL_CARD.md, too, for other programs; docs/deploy.md."""
     web: Annotated[Path | None, default("no page")] = None
-    """New folder for a page on which the policy runs in a browser; alone it is all that is written."""
+    """New folder for a page on which the policy runs in a browser; nothing else is written unless asked for."""
 
     def __call__(self) -> None:
         runs = runs_module()
@@ -168,7 +168,7 @@ class Diagnose:
     run: tyro.conf.Positional[Path]
     """Folder of the run, or of its exported results."""
     last: bool = False
-    """Look at the newest evaluation in place of the best policy's."""
+    """Look at the newest evaluation instead of the best policy's."""
 
     def __call__(self) -> None:
         from fmpjax import diagnose
@@ -183,7 +183,7 @@ class Report:
     folder: tyro.conf.Positional[Path]
     """Folder below which their results are."""
     out: Annotated[Path | None, default("FOLDER/report.html")] = None
-    """HTML page to write; the same in Markdown stands beside it."""
+    """HTML page to write; the same in Markdown is written beside it."""
 
     def __call__(self) -> None:
         runs_module()
@@ -210,7 +210,7 @@ class Settings:
     """Explain every setting: its default in each preset, its meaning and what it may be."""
 
     section: tyro.conf.Positional[str] = ""
-    """A section, such as `ppo`, or one setting; all of them where it is left out."""
+    """A section, such as `ppo`, or one setting; by default all of them."""
     markdown: bool = False
     """Print the page docs/settings.md, which has all of them."""
 

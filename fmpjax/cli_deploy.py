@@ -20,7 +20,7 @@ class Sim2Sim:
     model: Path
     """MJCF file with the policy's joints."""
     seconds: float = 10.0
-    """Length of an episode at most, of a policy that takes no commands."""
+    """Greatest length of an episode, for a policy that takes no commands."""
     episodes: int = 8
     """Starts from the default pose, all but the first with joints a little off."""
     gains: Literal["policy", "model"] = "policy"
@@ -30,7 +30,7 @@ class Sim2Sim:
     video: Annotated[Path | None, default("no video")] = None
     """Film the first episode: a file .mp4, or .gif where no encoder is installed."""
     keyboard: bool = False
-    """Steer it by the keys of MuJoCo's viewer, in place of episodes; needs a display."""
+    """Steer it by the keys of MuJoCo's viewer, instead of episodes; needs a display."""
     gamepad: bool = False
     """The same with a gamepad, too."""
 

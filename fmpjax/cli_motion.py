@@ -29,7 +29,7 @@ class Reading:
     quaternion: Annotated[str | None, default("told by the file")] = None
     """Order of the root's quaternion in place of the format's: wxyz or xyzw."""
     without: str = ""
-    """Words, as wrist,waist_roll: the file lacks the joints with one in their name, and they are zero."""
+    """Joints that are not in the file, and stay at zero: words in their names, such as wrist,waist_roll."""
     degrees: bool = False
     """The file's joints are in degrees."""
     accept_license: bool = False
@@ -79,9 +79,9 @@ class Import(Reading):
     loop: bool = False
     """Bend the last 0.4 s so that the end meets the start."""
     repeat: int = 1
-    """Write a loop so many times on end."""
+    """Write a loop this many times in a row."""
     speed: float = 1.0
-    """Play so many times as fast."""
+    """Factor by which it plays faster."""
     join: bool = False
     """Write the files as one motion, each beginning where the one before has ended."""
 
@@ -132,7 +132,7 @@ def _torques(robot: robots.Robot, before: MotionClip, after: MotionClip) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Check(Source):
-    """Print figures of a motion, healthy ranges and verdicts; exit code 1 where it is broken."""
+    """Print figures of a motion, healthy ranges and verdicts; exit code 1 if it is broken."""
 
     fix: bool = False
     """Put the soles on the floor, take out flips, clip joints to their limits, say what was changed, check again."""
@@ -184,7 +184,7 @@ class View(Source):
     browser: bool = False
     """Show it in a page of the browser, with its joints, contacts and the verdicts of `motion check`."""
     host: str = "127.0.0.1"
-    """Address of the page; others than this machine's own let everyone in the network see it."""
+    """Address of the page; any other than this machine's own lets everyone in the network see it."""
     port: int = 8080
     """Port of the page; 0 for any that is free."""
 
@@ -250,7 +250,7 @@ class Synthesize:
     turn: float = 0.0
     """To the left, rad/s."""
     duration: float = 8.0
-    """At most, s; whole strides."""
+    """Greatest duration, s; whole strides."""
     rate: float = 50.0
     """Hz."""
     robot: str = "unitree_g1"
@@ -286,7 +286,7 @@ class Synthesize:
 
 @dataclasses.dataclass(frozen=True)
 class Retarget:
-    """Put a human's motion capture (BVH, SMPL) on a robot by inverse kinematics; exit code 1 where that is broken."""
+    """Put a human's motion (BVH, SMPL) on a robot by inverse kinematics; exit code 1 if the result is broken."""
 
     file: tyro.conf.Positional[str]
     """Motion capture, by its path or address: .bvh, or .npz with SMPL's parameters as AMASS writes them."""
@@ -297,7 +297,7 @@ class Retarget:
     robot: str = "unitree_g1"
     """A robot under robots/."""
     skeleton: Annotated[Path | None, default("known names")] = None
-    """TOML file with the skeleton's joints of parts whose names are not known, as left_hip = "LThigh"."""
+    """TOML file that names the skeleton's joints, where their names are not known, such as left_hip = "LThigh"."""
     up: Annotated[str | None, default("told by the file")] = None
     """The file's axis that is up, y or z; by default the one along which hips are over ankles."""
     body_model: Annotated[Path | None, default("none")] = None
@@ -324,9 +324,9 @@ class Segment(Source):
     """Find the stretches of a long motion that can be trained: walking, running, turning, dancing, standing."""
 
     least: float = 2.0
-    """Length of a stretch at least, s."""
+    """Length of the shortest stretch, s."""
     out: Annotated[Path | None, default("none")] = None
-    """Folder to write the stretches to that are not broken, as NAME-KIND-FIRST.npz."""
+    """Folder for the stretches that are not broken, as NAME-KIND-FIRST.npz."""
     picture: Annotated[Path | None, default("none")] = None
     """Picture of speed and kinds over time, .png."""
 

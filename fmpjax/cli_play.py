@@ -22,11 +22,11 @@ class Play:
     model: Annotated[Path | None, default("the robot of the training")] = None
     """MJCF file with the joints of the policies, which then are files."""
     host: str = "127.0.0.1"
-    """Address to listen at; others than this machine's own let everyone in the network play."""
+    """Address to listen at; any other than this machine's own lets everyone in the network play."""
     port: int = 8080
     """Port of the page; 0 for any that is free."""
     native: bool = False
-    """Open MuJoCo's own viewer in place of a page, for one policy; needs a display."""
+    """Open MuJoCo's own viewer instead of a page, for one policy; needs a display."""
     gamepad: bool = False
     """Steer by a gamepad, too; with --native."""
     parent: Annotated[int | None, tyro.conf.Suppress] = None

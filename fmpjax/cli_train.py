@@ -69,9 +69,9 @@ class Train:
     seed: Annotated[int | None, _setting("seed")] = None
     """Seed of everything that is random."""
     seeds: Annotated[int | None, default("a single run")] = None
-    """Train as many seeds at once, from --seed on, in one program: the runs RUN/seed0, RUN/seed1, and so on."""
+    """Number of seeds to train at once, beginning with --seed, in one program: runs RUN/seed0, RUN/seed1, and so on."""
     transitions: Annotated[int | None, _setting("transitions")] = None
-    """Budget of environment steps; with --resume, a larger one than the run's lets it go on."""
+    """Budget of environment steps; with --resume, a larger one continues a finished run."""
     run: Annotated[Path | None, default("runs/METHOD-DATE-TIME")] = None
     """Folder of the run."""
     minutes: Annotated[float | None, default("no limit")] = None
@@ -81,13 +81,13 @@ class Train:
     distributed: bool = False
     """One of several processes that train together on all their devices, as SLURM starts them; see docs/scaling.md."""
     coordinator: Annotated[str | None, default("as the scheduler says")] = None
-    """HOST:PORT of the first process, where no scheduler tells it."""
+    """HOST:PORT of the first process, if no scheduler provides it."""
     processes: Annotated[int | None, default("as the scheduler says")] = None
     """Number of processes, likewise."""
     process: Annotated[int | None, default("as the scheduler says")] = None
     """Number of this process, from 0, likewise."""
     resume: bool = False
-    """Go on with the run in --run, with its settings."""
+    """Continue the run in --run, with its settings."""
     live: bool = False
     """Show the policy as it trains in a page of the browser; docs/play.md."""
     port: int = 8080
@@ -155,16 +155,16 @@ class Train:
             first = configuration.with_changes(configuration.Config(), {"seed": changes["seed"]}).seed
             folders = [self.run / f"seed{first + i}" for i in range(self.seeds or 1)]
         if self.seeds is not None and self.seeds != len(folders):
-            raise UserError(f"run {self.run} has {len(folders)} seeds: it cannot go on with {self.seeds}")
+            raise UserError(f"run {self.run} has {len(folders)} seeds: it cannot continue with {self.seeds}")
         group = [runs.Run.open(folder) for folder in folders]
         saved = configuration.flatten(group[0].config)
         if self.preset is not None and self.preset != saved["preset"]:
-            raise UserError(f"run {self.run} has preset {saved['preset']!r}: it cannot go on as {self.preset!r}")
+            raise UserError(f"run {self.run} has preset {saved['preset']!r}: it cannot continue as {self.preset!r}")
         asked = configuration.flatten(configuration.with_changes(group[0].config, changes))
         longer = asked["transitions"] > saved["transitions"]
         for key in changes:
             if asked[key] != saved[key] and not (key == "transitions" and longer):
-                raise UserError(f"run {self.run} has {key} {saved[key]!r}: it cannot go on with {asked[key]!r}")
+                raise UserError(f"run {self.run} has {key} {saved[key]!r}: it cannot continue with {asked[key]!r}")
         return group
 
     def _extend(self, group) -> None:

@@ -91,7 +91,7 @@ class Steps(NamedTuple):
     extras: dict[str, jax.Array]  # what the policy said of the action, each [T, N, ...]
     fell: jax.Array  # [T, N] bool
     timed_out: jax.Array  # [T, N] bool; a fall on the same step is a fall
-    nonfinite: jax.Array  # [T, N] bool, a fall for whoever learns
+    nonfinite: jax.Array  # [T, N] bool; learning counts it as a fall
     length: jax.Array  # [T, N] int32, steps of the episode up to and including this one
     frame: jax.Array  # [T, N, F] compact frame after the step, before any reset
     window: jax.Array  # [T, N, H] int32 indices into the frame table

@@ -160,7 +160,9 @@ def observation_terms(robot: Robot, form: str) -> dict[str, int]:
     return root | angles | {"joint_velocity": joints} | points | told
 
 
-def observation(robot: Robot, qpos: jax.Array, qvel: jax.Array, form: str) -> jax.Array:
+def observation(
+    robot: Robot, qpos: Float[Floats, "*batch q"], qvel: Float[Floats, "*batch v"], form: str
+) -> Float[jax.Array, "*batch O"]:
     """The observation ``[..., O]`` of states, in a form that is not deployable, without the command."""
     return _observation(robot, _parts(robot, qpos, qvel), form)
 

@@ -51,7 +51,7 @@ def keep_compiled() -> None:
     """Have JAX keep compiled programs in the user's cache folder, 1 GiB at most, so that a second run starts at once.
 
     ``JAX_COMPILATION_CACHE_DIR`` names another folder, or none where it is empty. Machine code is of one kind of
-    processor, so each has a folder of its own. Runs may share it.
+    processor, so each has its own folder. Runs may share it.
     """
     import jax
 

@@ -22,7 +22,7 @@ class Offender(NamedTuple):
 
 def offender(sim: PhysicsState, action: jax.Array, finite: jax.Array, before: Offender) -> Offender:
     """Each environment's last offender after a step from ``sim`` that left ``finite [N]`` of them finite."""
-    # Each keeps its own, which needs no word from the others while the rollout goes on.
+    # Each keeps its own, which needs nothing from the others during the rollout.
     here = Offender(sim.qpos, sim.qvel, action)
     return jax.tree.map(lambda new, old: jnp.where(finite[:, None], old, new), here, before)
 

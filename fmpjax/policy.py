@@ -121,7 +121,7 @@ def metadata(path: str | Path) -> dict[str, str]:
 
 
 def load(path: str | Path) -> Policy:
-    """Read what `save` wrote.
+    """Read a policy from ``policy.npz``, which ``fmpjax export`` writes.
 
     Raises:
       UserError: the file is missing or is no policy.

@@ -27,7 +27,7 @@ from brax.training.types import UInt64  # noqa: E402
 
 
 class PPOState(NamedTuple):
-    """Everything that learns, but for the prior."""
+    """Everything that learns, except the prior."""
 
     actor: Any
     critic: Any

@@ -136,7 +136,7 @@ def _from_folder(name: str) -> Robot:
         raise UserError(f"{facts} is not TOML ({error}): expected the keys in docs/robots.md") from None
     except KeyError as error:
         said = str(error.args[0])[:80]
-        raise UserError(f"{facts} lacks or misnames {said}: expected the keys in docs/robots.md") from None
+        raise UserError(f"{facts} has no {said}, or misnames it: expected the keys in docs/robots.md") from None
     except (TypeError, ValueError) as error:
         raise UserError(f"{path.parent} cannot be read as a robot: {' '.join(str(error).split())}") from None
 
@@ -200,7 +200,7 @@ def _read(name: str, path: Path) -> Robot:
 
 
 def _check(path: Path, model: mujoco.MjModel) -> None:
-    """Refuse a model that the rest of the program, which has kinematics of its own, would misread."""
+    """Refuse a model that the rest of the program, which has its own kinematics, would misread."""
     hinges, soles = np.arange(1, model.njnt), [g for g in map(model.geom, range(model.ngeom)) if "_foot_" in g.name]
     feet = [{int(g.bodyid[0]) for g in soles if g.name.startswith(side)} for side in _FEET]
     for holds, expected in (

@@ -174,7 +174,7 @@ def fit_score(
     Args:
       epsilon: entropy coefficient; by default a tenth of the median cross cost, at least 1e-3 / d.
 
-    Example:
+    Examples:
       >>> import jax.numpy as jnp
       >>> from fmpjax import transport
       >>> fitted = transport.fit_score(jnp.zeros((4, 1)), jnp.ones((4, 1)))

@@ -188,11 +188,11 @@ def test_unwritable_run_folder(refused, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["--seed", "7"], "seed 0: it cannot go on with 7"),
-        (["--preset", "paper"], "preset 'smoke': it cannot go on as 'paper'"),
-        (["--reset", "fixed"], "env.reset 'dataset': it cannot go on with 'fixed'"),
-        (["--transitions", "100"], "transitions 10240: it cannot go on with 100"),
-        (["--set", "ppo.hidden=8,8"], "ppo.hidden (64, 64): it cannot go on with (8, 8)"),
+        (["--seed", "7"], "seed 0: it cannot continue with 7"),
+        (["--preset", "paper"], "preset 'smoke': it cannot continue as 'paper'"),
+        (["--reset", "fixed"], "env.reset 'dataset': it cannot continue with 'fixed'"),
+        (["--transitions", "100"], "transitions 10240: it cannot continue with 100"),
+        (["--set", "ppo.hidden=8,8"], "ppo.hidden (64, 64): it cannot continue with (8, 8)"),
         (["--set", "nope=1"], "unknown setting 'nope'"),
     ],
 )
@@ -227,7 +227,7 @@ def test_seeds_of_a_group(refused, tmp_path):
     (tmp_path / "group" / "seed0.log").write_text("of another program")
     resume = ("train", "--resume", "--run", "group")
     assert "setting seed is 'abc': expected a whole number" in refused(*resume, "--set", "seed=abc")
-    assert "has 1 seeds: it cannot go on with 2" in refused(*resume, "--seeds", "2")
+    assert "has 1 seeds: it cannot continue with 2" in refused(*resume, "--seeds", "2")
 
 
 def test_a_clip_may_have_any_name_and_go(tmp_path, rows, monkeypatch):

@@ -38,7 +38,7 @@ def test_every_requirement_is_imported_and_pinned():
         imported = re.search(rf"^\s*(import|from) {module}\b|import_module\(\"{module}\"\)", code, re.MULTILINE)
         assert imported or name in USED_BY_OTHERS, name
         assert name in pinned, name
-    assert {_name(requirement) for requirement in optional["dev"]} <= pinned
+    assert {_name(requirement) for extra in ("dev", "docs") for requirement in optional[extra]} <= pinned
 
 
 def test_the_oldest_versions_are_those_that_the_project_declares():
@@ -104,8 +104,8 @@ def _make(*arguments: str) -> subprocess.CompletedProcess:
             r"JAX_PLATFORMS: .*; as an environment variable it stands before make: JAX_PLATFORMS=\.\.\. make train",
         ),
         *(((target, "XYZ=1"), rf"XYZ: make {target} takes .*")
-          for target in ("render", "test", "test-fast", "test-oldest", "coverage", "check", "format", "build", "clean",
-                         "help")),
+          for target in ("render", "test", "test-fast", "test-oldest", "coverage", "check", "docs", "format", "build",
+                         "clean", "help")),
     ],
 )  # fmt: skip
 def test_make_refuses_an_unknown_variable(arguments, unknown):
@@ -136,7 +136,7 @@ def test_the_oldest_versions_are_tested_in_an_environment_of_their_own():
 
 @needs_make
 @pytest.mark.skipif(not (ROOT / ".ci").is_dir(), reason="the source archive leaves it out")
-def test_the_check_of_a_submission_lints_and_tests_and_installs_once(tmp_path):
+def test_the_check_of_a_submission_lints_builds_the_site_and_tests_and_installs_once(tmp_path):
     """On a machine that has nothing: `make` prints what it would do."""
     stub = tmp_path / "make"
     stub.write_text(f'#!/bin/sh\nexec {shutil.which("make")} --dry-run VENV=nowhere UV=uv "$@"\n')
@@ -146,8 +146,9 @@ def test_the_check_of_a_submission_lints_and_tests_and_installs_once(tmp_path):
     done = subprocess.run([ROOT / ".ci" / "run"], env=environment, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count(".[dev,viz,retarget]") == 1
-    lint, first_test = done.stdout.index("nowhere/bin/ruff check"), done.stdout.index("-m pytest")
-    assert done.stdout.index(".[dev,viz,retarget]") < lint < first_test
+    said = (".[dev,viz,retarget]", "nowhere/bin/ruff check", "nowhere/bin/mkdocs build", "-m pytest")
+    places = [done.stdout.index(words) for words in said]
+    assert places == sorted(places)
 
 
 def _pages():

@@ -167,7 +167,7 @@ def test_a_run_of_another_robot_is_refused_by_name(trained, capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(["train", "--resume", "--robot", "unitree_g1", "--run", str(trained)])
     assert stop.value.code == 2
-    assert "has robot 'strider': it cannot go on with 'unitree_g1'" in capsys.readouterr().err
+    assert "has robot 'strider': it cannot continue with 'unitree_g1'" in capsys.readouterr().err
     # A policy moved to another robot: the run's own demonstration tells.
     path = trained / "config.json"
     text = path.read_text()

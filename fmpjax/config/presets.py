@@ -22,7 +22,7 @@ _LAPTOP: dict[str, Any] = {
     "physics.ls_iterations": 5,
     "physics.frictionloss": 0.0,
     "env.count": 128,  # many small policy updates in few transitions
-    # A cap that grows with the robot's survival, a time-out being no end: docs/learning.md says what either does.
+    # A cap that grows with the robot's survival, a time-out being no end: docs/trials.md says what either does.
     "env.first_cap": 64,
     "env.last_cap": 150,
     "env.demonstration_parts": 1,  # samples alone, as when this preset was tuned

@@ -224,7 +224,7 @@ class PWILConfig(Section):
 
     scale: PositiveFloat = 5.0  # alpha, the reward of a perfect step [L]
     decay: PositiveFloat = 5.0  # beta, of the reward with the distance [L]
-    slack: NonNegativeFloat = 1e-6  # mass that a step lacks of 1 / T, so that the demonstration's never runs out [L]
+    slack: NonNegativeFloat = 1e-6  # by how much the mass of a step is below 1 / T; the demonstration lasts [L]
 
 
 # Transformer layers, heads, numbers per head.
@@ -311,7 +311,8 @@ class Config(Section):
 
     method: str = "fmp"  # motion prior, as `fmpjax list` names it [P]
     robot: str = "unitree_g1_29dof"  # folder under robots/ [M]
-    # a bundled motion's name, a file or its address (https://, hf://); several as NAME[:WEIGHT],NAME[:WEIGHT] [D]
+    # a bundled motion's name, a file or its address (https://, hf://); several with commas between, weights as NAME:WEIGHT
+    # [D]
     motion: str = "walk"
     frames: str = ""  # source rows "first:last" of the motion, both included; empty for all [D]
     preset: str = "paper"  # preset that the other settings depart from

@@ -5,7 +5,7 @@
 from those that do not among the 62 below ``experiments/results``, which hold 354 evaluations; `Rule.evidence` names
 them. Where no course shows the fault, the bound lies beyond all that the courses reach, and the evidence says so.
 
-A figure that a course lacks silences the rules that read it, and the report says which.
+Rules whose figure is missing in a course are not checked, and the report names them.
 """
 
 from fmpjax.diagnose.course import Course, Missing, newest, read

@@ -17,7 +17,7 @@ RECENT = 10  # rows that a training figure is the mean of: a million transitions
 
 
 class Missing(KeyError):
-    """A figure that a course lacks, or that is not defined in it."""
+    """A figure that a course does not have, or that is not defined in it."""
 
 
 @dataclasses.dataclass(frozen=True)

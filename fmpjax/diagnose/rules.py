@@ -61,7 +61,7 @@ class Rule:
         """What is wrong; None where the figure is healthy or the rule does not apply.
 
         Raises:
-          Missing: the course lacks a figure.
+          Missing: the course does not have a figure.
         """
         if self.methods and course.config.method not in self.methods:
             return None

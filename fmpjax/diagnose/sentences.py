@@ -14,7 +14,7 @@ def symptoms(course: Course) -> dict[str, str]:
 
 
 def apply_rules(course: Course) -> tuple[dict[str, str], dict[str, list[str]]]:
-    """Sentences by rule, and the rules that could not be checked by the figure that they lack."""
+    """Sentences by rule, and the rules that could not be checked by the figure that is missing."""
     found, lacking = {}, {}
     for rule in RULES:
         try:

@@ -45,7 +45,7 @@ def main(
       together: train all seeds of a method and reset as one program, which pays on an accelerator.
       video: film the final policies of each reset's first seed side by side.
     """
-    # An exception, so that who ends the comparison ends its cells, which save.
+    # An exception, so that ending the comparison ends its cells, which save.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     specification = cells.read_specification(spec) if spec else Specification()
     named = {

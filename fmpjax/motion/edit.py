@@ -89,7 +89,7 @@ def repeated(clip: MotionClip, times: int) -> MotionClip:
       UserError: the result has more samples than a motion may have.
     """
     if (len(clip) - 1) * times >= MOST_SAMPLES:
-        raise UserError(f"--repeat is {times}: {len(clip)} samples so often are more than {MOST_SAMPLES}")
+        raise UserError(f"--repeat is {times}: {len(clip)} samples that many times are more than {MOST_SAMPLES}")
     closed, turn = looped(clip).qpos, np.array([1.0, 0.0, 0.0, 0.0])
     pieces, place = [closed[:1]], closed[0, :3]
     step = closed[1:] - np.concatenate([closed[0, :3], np.zeros(clip.qpos.shape[1] - 3)])

@@ -114,7 +114,7 @@ class Gait:
     def said(self) -> str:
         """The chosen numbers in words."""
         if not self.chosen:
-            said, own = "the robot's own style but for the given numbers", OPEN.on(self.robot).cadence
+            said, own = "the robot's own style except for the given numbers", OPEN.on(self.robot).cadence
             fitting = fitted(self.robot, self.command).cadence
             if self.style.cadence != own or math.isclose(own, fitting, rel_tol=0.05):
                 return said

@@ -37,7 +37,7 @@ class Stride:
     the world's. The pelvis faces where the frame did ``lag`` of a stride ago. The style has every number.
 
     Raises:
-      UserError: the robot's legs have not six hinges, or it lacks a joint that its walk moves.
+      UserError: the robot's legs do not have six hinges, or it has no joint that its walk moves.
     """
 
     def __init__(self, robot: Robot, way: np.ndarray, angle: float, period: float, style: Style, lag: float = 0.0):

@@ -64,9 +64,9 @@ class MjxPhysics:
 
             built = mjx.put_model(self.model, impl="warp", device=self._device)
         except NotImplementedError as error:
-            _refuse(f"the robot's model needs what Warp lacks ({error}): expected physics.impl 'jax'")
+            _refuse(f"the robot's model needs what Warp does not have ({error}): expected physics.impl 'jax'")
         except (ImportError, RuntimeError) as error:
-            _refuse(f"this installation lacks it ({error}): install fmpjax[warp]")
+            _refuse(f"it is not installed ({error}): install fmpjax[warp]")
         except AssertionError:
             _refuse(f"it runs on an NVIDIA device or a CPU, found {self._device.platform}: expected physics.impl 'jax'")
         self._overflow = int(Lost.NEFC | Lost.NJMAX_NNZ | Lost.BROADPHASE | Lost.NARROWPHASE)

@@ -14,7 +14,7 @@ SCORES = 0.2  # s between two scores of the motion prior
 
 
 class Loader:
-    """Reads policies in a thread of its own, one after another."""
+    """Reads policies in a separate thread, one after another."""
 
     def __init__(self, session: Session, sources: Sequence[Source], names: Sequence[str]):
         """A loader for players that have the policies of these names."""

@@ -17,7 +17,7 @@ class Server(viser.ViserServer):
     """viser's server without its tunnel, by which a page could be opened to the internet."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refuse: who wants others to see the page names an address."""
+        """Refuse: to let others see the page, name an address."""
         return None
 
     def stop(self) -> None:
@@ -28,7 +28,7 @@ class Server(viser.ViserServer):
 
 @contextlib.contextmanager
 def beside(server: viser.ViserServer, title: str) -> Generator[None]:
-    """A panel of its own on the left of a page, for what is added to the page within."""
+    """A separate panel on the left of a page, for what is added to the page within."""
     panel = server.gui.add_panel()
     with panel.add_tab(title):
         yield
@@ -67,7 +67,7 @@ def start(title: str, host: str = HOST, port: int = PORT) -> Server:
         server = Server(host=host, port=port, label=title, verbose=False)
     if server.get_port() != port:
         server.stop()
-        raise UserError(f"port {port} was taken at this moment: name another --port, or 0 for any")
+        raise UserError(f"port {port} was just taken: name another --port, or 0 for any")
     server.gui.configure_theme(
         control_width="large", show_logo=False, show_share_button=False, brand_color=(42, 111, 176)
     )

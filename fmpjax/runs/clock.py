@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from fmpjax.config import Config
 
-SAVE_INTERVAL = 120.0  # s between checkpoints at most, but for the iterations in hand
+SAVE_INTERVAL = 120.0  # s at most between checkpoints, except for the iterations in hand
 
 
 class End(enum.Enum):

@@ -86,7 +86,7 @@ def read(
       shapes: of what it takes and gives, ``[1, O]`` and ``[1, J]``.
 
     Raises:
-      UserError: the metadata lacks something, cannot be read or does not fit the shapes.
+      UserError: the metadata is incomplete, cannot be read or does not fit the shapes.
     """
     expected = "expected a file as `fmpjax export --onnx` writes it"
     try:
@@ -156,7 +156,7 @@ def _check_plain(said: Mapping[str, str]) -> None:
     for key, plain in (("scale", "1.0"), ("clip", "-inf;inf")):
         values = set(said[f"observation_terms_{key}"].split(","))
         if values != {plain}:
-            raise ValueError(f"observation_terms_{key} is {min(values - {plain})}, and sim2sim knows {plain} alone")
+            raise ValueError(f"observation_terms_{key} is {min(values - {plain})}, and sim2sim knows only {plain}")
 
 
 def _history(said: Mapping[str, str]) -> int:

@@ -53,7 +53,7 @@ def prepare(spec: mujoco.MjSpec, policy: Policy, path: str | Path, own_gains: bo
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         raise UserError(f"{path} has no hinge {', '.join(missing[:3])}{more}: the policy moves {policy.robot}")
     if sum(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints) != 1:
-        raise UserError(f"{path} has not one free joint: expected a robot whose root is free, and nothing else that is")
+        raise UserError(f"{path} has no free joint, or several: expected one, of the robot's root")
     for key in list(spec.keys):  # of as many controls as there were
         spec.delete(key)
     said = _without_missing_meshes(spec, path)

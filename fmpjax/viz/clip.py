@@ -49,7 +49,7 @@ def no_window() -> str | None:
 
 
 def _window_opens() -> bool:
-    """Try a window, in a process of its own: MuJoCo's viewer ends the process where none opens."""
+    """Try a window, in a separate process: MuJoCo's viewer ends the process where none opens."""
     code = (
         "import glfw, sys; ready = glfw.init(); glfw.window_hint(glfw.VISIBLE, False);"
         "sys.exit(not (ready and glfw.create_window(64, 64, '', None, None)))"

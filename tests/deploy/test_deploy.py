@@ -538,7 +538,7 @@ def test_a_model_or_file_that_does_not_fit_is_refused(exported, robot, tmp_path)
         ("action_scale", "1,1", "has 2 of scale: expected one per joint, 29"),
         ("joint_loads", "1,1", "has 2 of joint_loads: expected one per joint, 29"),
         ("key_points", "[1]", "has metadata that cannot be read"),
-        ("observation_terms_scale", "1.0,2.0", "observation_terms_scale is 2.0, and sim2sim knows 1.0 alone"),
+        ("observation_terms_scale", "1.0,2.0", "observation_terms_scale is 2.0, and sim2sim knows only 1.0"),
         ("step_dt", "often", "has metadata that cannot be read"),
         ("observation_names", "a,b,c,d,e,f,g", "observes 'a', which sim2sim does not know"),
         ("observation_widths", "1,6,3,3,29,29,16", r"its metadata tells of \[1, 87\] to \[1, 29\]"),

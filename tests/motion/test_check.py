@@ -534,5 +534,5 @@ def test_real_clips_are_fit(robot, external, name, frames):
 
 
 def test_a_clip_is_not_repeated_without_end(walk):
-    with pytest.raises(UserError, match="--repeat is 100000000: 379 samples so often are more than"):
+    with pytest.raises(UserError, match="--repeat is 100000000: 379 samples that many times are more than"):
         edit.repeated(walk, 100_000_000)

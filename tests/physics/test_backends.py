@@ -275,7 +275,7 @@ def test_full_buffers_of_warp_show(robot, states, warp, capfd):
 
 def test_warp_that_is_not_installed_is_refused(robot, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco.mjx.third_party.mujoco_warp._src.types", None)
-    with pytest.raises(UserError, match=r"'warp': this installation lacks it .*: install fmpjax\[warp\]"):
+    with pytest.raises(UserError, match=r"'warp': it is not installed .*: install fmpjax\[warp\]"):
         physics.make(robot, dataclasses.replace(PAPER, backend="mjx", impl="warp"))
 
 

@@ -66,7 +66,7 @@ def test_runs_that_differ_in_more_are_refused(tmp_path):
     ("arguments", "message"),
     [
         (["--seeds", "0"], "--seeds is 0: expected at least 1"),
-        (["--resume", "--run", "GROUP", "--seeds", "3"], "has 2 seeds: it cannot go on with 3"),
+        (["--resume", "--run", "GROUP", "--seeds", "3"], "has 2 seeds: it cannot continue with 3"),
         (["--resume", "--run", "GROUP", "--seed", "9"], "seed9 is not a run folder"),
     ],
 )

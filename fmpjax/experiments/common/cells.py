@@ -59,7 +59,7 @@ class Cell:
 
     @property
     def command(self) -> list[str]:
-        """Arguments of ``fmpjax train``, but for the run's folder."""
+        """Arguments of ``fmpjax train``, without the run's folder."""
         settings = [f"--set={key}={_text(value)}" for key, value in self.changes.items()]
         return ["train", "--preset", self.config.preset, *settings]
 

@@ -60,7 +60,7 @@ def save(
 
     Args:
       record: what the JSON file holds; what is not a number there becomes null.
-      rows: lines of the CSV file; what one lacks stays empty.
+      rows: lines of the CSV file; what is missing in one stays empty.
       places: folders and files of this machine, of which only the names are kept.
     """
     from fmpjax import runs
