@@ -311,8 +311,8 @@ class Config(Section):
 
     method: str = "fmp"  # motion prior, as `fmpjax list` names it [P]
     robot: str = "unitree_g1_29dof"  # folder under robots/ [M]
-    # a bundled motion's name, a file or its address (https://, hf://); several with commas between, weights as NAME:WEIGHT
-    # [D]
+    # a bundled motion's name, a file or its address (https://, hf://); several with commas between, weights as
+    # NAME:WEIGHT [D]
     motion: str = "walk"
     frames: str = ""  # source rows "first:last" of the motion, both included; empty for all [D]
     preset: str = "paper"  # preset that the other settings depart from
