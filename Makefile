@@ -115,5 +115,5 @@ $(READY): pyproject.toml $(CONSTRAINTS)
 	@touch $@
 
 $(VENV)/.extras: $(READY)
-	@$(install) '.[warp,deploy,play]'
+	@$(install) '.[warp,deploy,play,benchmark]'
 	@touch $@
