@@ -121,7 +121,7 @@ $(READY): pyproject.toml $(CONSTRAINTS)
 	@touch $@
 
 $(VENV)/.extras: $(READY)
-	@$(install) '.[warp,deploy,play,hub]'
+	@$(install) '.[warp,deploy,play,hub,benchmark]'
 	@touch $@
 
 $(VENV)/.docs: $(READY)

@@ -1,15 +1,13 @@
 """Evaluation of a frozen policy on first episodes (section IV-C of the paper)."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from ott.geometry import geometry
-from ott.tools import sinkhorn_divergence
 
 from fmpjax import features, frozen, jsons, kinematics, metrics, rotations, tables, transport
 from fmpjax.config import Config, FeatureConfig
@@ -26,7 +24,6 @@ LEAST_SPEED = 0.1  # m/s, to which an error in speed is relative at least [D]
 OTHER_SIZES = 3  # times fewer episodes at the sizes of perturbation that are not the headline's [D]
 LISTED = 12  # motions that the table names
 STARTS_SEED = 1  # of the episodes' starts, the same in every evaluation [D]
-DISCREPANCY_THRESHOLD, DISCREPANCY_ITERATIONS = 1e-4, 2000  # marginal error (L1) of its solves; iterations at most [D]
 
 
 class Start(NamedTuple):
@@ -48,6 +45,7 @@ class Episodes(NamedTuple):
     history: np.ndarray  # [N, H, F] compact frames up to the start
     clip: np.ndarray  # [N] index of the demonstration that it starts in, 0 for the default pose
     starts: tuple[Start, ...] = ()  # every size, the headline's included, the smallest first
+    targets: np.ndarray | None = None  # [T, n, J] joint targets of the detailed episodes, rad; None: not recorded
 
 
 class Share(NamedTuple):
@@ -84,6 +82,9 @@ class Evaluation:
     demonstration_speed: float  # m/s
     demonstration_turn: float  # rad/s, to the left
     demonstration_turning: float  # rad/s, either way
+    action_rate: float  # rad/s, of the joint targets
+    joint_jerk: float  # rad/s³
+    power: float  # W, mechanical, of the servos
     joint_ranges: tuple[float, ...]  # degrees, six sagittal joints
     expert_ranges: tuple[float, ...]  # degrees
     starts: tuple[Start, ...] = ()  # falls at every size of perturbation
@@ -95,10 +96,7 @@ class Evaluation:
 
         Too fast is no better than too slow. Where the demonstration turns, speeds are along the own heading.
         """
-        late = self.path_speed if self.demonstration_turning > metrics.TURNS else self.late_speed
-        unit = max(self.demonstration_speed, LEAST_SPEED)
-        error = 1.0 if np.isnan(late) else abs(late - self.demonstration_speed) / unit
-        return (1.0 - self.falls / self.episodes) * max(0.0, 1.0 - error)
+        return (1.0 - self.falls / self.episodes) * max(0.0, 1.0 - pace_error(vars(self)))
 
     def as_dict(self) -> dict[str, float]:
         """Scalar figures, by name; `names` says which."""
@@ -117,6 +115,13 @@ class Evaluation:
     def to_json(self) -> str:
         """All figures; what is not defined is null."""
         return jsons.dumps(self.record())
+
+
+def pace_error(figures: Mapping[str, Any]) -> float:
+    """Relative error of an evaluation's late speed; 1, as of a robot that stands, where nobody lasts so long."""
+    late = figures["path_speed" if figures["demonstration_turning"] > metrics.TURNS else "late_speed"]
+    unit = max(figures["demonstration_speed"], LEAST_SPEED)
+    return 1.0 if np.isnan(late) else abs(late - figures["demonstration_speed"]) / unit
 
 
 def names(config: Config) -> list[str]:
@@ -182,31 +187,29 @@ class Evaluator:
         def step(carry, drawn):
             now, alive, fell, length = carry
             taken = frozen.step(self.trainer, env, policy, now, alive, drawn)
-            sim = taken.now.physics
-            return (taken.now, taken.alive, fell | taken.fell, length + alive), (
-                sim.qpos[:headline],
-                sim.qvel[:headline],
-            )
+            sim, targets = taken.now.physics, env.actions(taken.action)[:headline][:DETAILED]
+            record = sim.qpos[:headline], sim.qvel[:headline], targets
+            return (taken.now, taken.alive, fell | taken.fell, length + alive), record
 
         alive = jnp.ones(len(self.rows), bool)
-        (_, _, fell, length), (qpos, qvel) = jax.lax.scan(
+        (_, _, fell, length), (qpos, qvel, targets) = jax.lax.scan(
             step,
             (start, alive, ~alive, jnp.zeros(len(self.rows), jnp.int32)),
             env.disturbance_draws(jnp.asarray(self._key), env.config.episode_steps, len(self.rows)),
             length=env.config.episode_steps,
         )
-        return qpos, qvel, length, fell, start.physics.qpos, start.history
+        return qpos, qvel, targets, length, fell, start.physics.qpos, start.history
 
     def play(self, state: PPOState) -> Episodes:
         """First episodes under ``state``'s mean action."""
         headline = slice(0, self.count)
-        qpos, qvel, *each = map(np.asarray, self._play(state))
+        qpos, qvel, targets, *each = map(np.asarray, self._play(state))
         length, fell, start_qpos, history = (values[headline] for values in each)
         clip = self.trainer.env.clip_of(self.rows[headline])
         ends = np.cumsum(list(self._sizes.values()))
         falls = [int(part.sum()) for part in np.split(each[1], ends[:-1])]
         starts = sorted(map(Start, self._sizes, self._sizes.values(), falls))
-        return Episodes(qpos, qvel, length, fell, start_qpos, history, clip, tuple(starts))
+        return Episodes(qpos, qvel, length, fell, start_qpos, history, clip, tuple(starts), targets)
 
     def __call__(self, state: PPOState) -> Evaluation:
         return self.measure(self.play(state))
@@ -255,7 +258,8 @@ class Evaluator:
             demonstration_speed=float(library.mean(own_speed)),
             demonstration_turn=float(library.mean(own_turn)),
             demonstration_turning=float(library.mean(abs(own_turn))),
-            joint_ranges=tuple(np.degrees(_finite_mean(ranges)).round(2).tolist()),
+            **self._effort(played, length),
+            joint_ranges=tuple(np.degrees(metrics.mean_ranges(ranges)).round(2).tolist()),
             expert_ranges=tuple(np.degrees(expert).round(2).tolist()),
             starts=played.starts,
             motions=self._shares(played, np.where(turns, path_speed, speed), own_speed),
@@ -273,6 +277,18 @@ class Evaluator:
             falls = int(played.fell[mine].sum())
             shares.append(Share(clip.name, int(mine.sum()), falls, late.mean, late.n, own_speed[i]))
         return tuple(shares)
+
+    def _effort(self, played: Episodes, length: np.ndarray) -> dict[str, float]:
+        """How smoothly and how hard the joints work in the detailed episodes; NaN where no targets are recorded."""
+        robot, rate, count = self.trainer.robot, self.trainer.config.control_rate, len(length)
+        angle, velocity = played.qpos[:, :count, 7:], played.qvel[:, :count, 6:]
+        found = {"joint_jerk": metrics.joint_jerk(velocity, length, rate=rate)}
+        if played.targets is not None:
+            servo = {"stiffness": robot.stiffness, "damping": robot.damping, "effort": robot.effort}
+            found["action_rate"] = metrics.action_rate(played.targets, length, rate=rate)
+            found["power"] = metrics.power(played.targets, angle, velocity, length, **servo)
+        means = {name: metrics.summarise(values).mean for name, values in found.items()}
+        return {"action_rate": np.nan, "power": np.nan} | means
 
     def _feet(self, qpos: jax.Array) -> tuple[np.ndarray, np.ndarray]:
         """Foot positions ``[T, n, F, 3]`` (m, the mean of a foot's sole points) and contacts ``[T, n, F]``."""
@@ -296,23 +312,7 @@ class Evaluator:
         pick = np.random.default_rng(0).permutation(len(steps))[:WINDOWS]
         rows = steps[pick, None] + 1 + np.arange(horizon)
         evaluated = self._feature_map(jnp.asarray(frames[rows, episodes[pick, None]]))
-        return float(discrepancy(evaluated, self._expert, self._feature_map.dimension))
-
-
-@jax.jit
-def discrepancy(x: jax.Array, y: jax.Array, dimension: jax.Array) -> jax.Array:
-    """Debiased Sinkhorn divergence between features ``x [n, D]`` and ``y [m, D]``, at the cross cost's epsilon."""
-    cross = transport.squared_cost(x, y)
-    epsilon = transport.entropy_coefficient(cross, dimension)
-    value, _ = sinkhorn_divergence.sinkhorn_divergence(
-        geometry.Geometry,
-        cross,
-        transport.squared_cost(x, x),
-        transport.squared_cost(y, y),
-        epsilon=epsilon,
-        solve_kwargs={"threshold": DISCREPANCY_THRESHOLD, "max_iterations": DISCREPANCY_ITERATIONS},
-    )
-    return value
+        return float(transport.discrepancy(evaluated, self._expert, self._feature_map.dimension))
 
 
 def planar_speed(clip: MotionClip) -> float:
@@ -324,13 +324,6 @@ def turning(clip: MotionClip) -> float:
     """Mean turning rate of a clip's root, rad/s, positive to the left."""
     yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
     return float(yaw[-1] - yaw[0]) / clip.duration
-
-
-def _finite_mean(ranges: np.ndarray) -> np.ndarray:
-    """Mean of ``ranges [W, N, 6]`` over windows and episodes that have them, ``[6]``."""
-    flat = ranges.reshape(-1, ranges.shape[-1])
-    kept = flat[np.isfinite(flat).all(-1)]
-    return kept.mean(0) if len(kept) else np.full(ranges.shape[-1], np.nan)
 
 
 def _listed(motions: tuple[Share, ...]) -> list[Share]:
@@ -353,6 +346,8 @@ def table(evaluation: Evaluation) -> str:
         ("amplitude MAE", f"{e.amplitude_mae:.2f}", "degrees"),
         ("Sinkhorn discrepancy", f"{e.discrepancy:.4f}", "in the paper's features"),
         ("foot speed in contact", f"{e.contact_foot_speed:.3f}", "m/s"),
+        ("rate of the joint targets", f"{e.action_rate:.2f}", f"rad/s; jerk of the joints {e.joint_jerk:.0f} rad/s³"),
+        ("power of the servos", f"{e.power:.0f}", "W, mechanical"),
         ("left-right imbalance", f"{e.imbalance:.3f}", ""),
         ("forward displacement", f"{e.displacement:.2f}", "m"),
         ("leg ranges (hip, knee, ankle; L, R)", " ".join(f"{r:.0f}" for r in e.joint_ranges), "degrees"),

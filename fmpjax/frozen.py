@@ -16,6 +16,7 @@ class Step(NamedTuple):
     now: EnvState  # of episodes that had ended before, as it was
     alive: jax.Array  # [N] bool, whether the episode goes on
     fell: jax.Array  # [N] bool, whether it ended in this step by a fall
+    action: jax.Array  # [N, J] normalized, taken
     earned: jax.Array | None  # [N] in [0, 1], the command's reward of the step; None without a command
 
 
@@ -45,4 +46,4 @@ def step(trainer: Trainer, env: Env, policy: Any, now: EnvState, alive: jax.Arra
         return jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
     physics, observed = jax.tree.map(hold, (reached.physics, reached.observed), (now.physics, now.observed))
-    return Step(now._replace(physics=physics, observed=observed), going_on, alive & reached.fell, earned)
+    return Step(now._replace(physics=physics, observed=observed), going_on, alive & reached.fell, action, earned)

@@ -183,6 +183,11 @@ def expert_ranges(
     return ranges[:, 0].mean(axis=0)
 
 
+def mean_ranges(ranges: np.ndarray) -> np.ndarray:
+    """Mean of ``ranges [W, N, 6]`` over the windows and episodes that have them, ``[6]``."""
+    return _mean(np.where(np.isfinite(ranges).all(-1, keepdims=True), ranges, np.nan), axis=(0, 1))
+
+
 def excursion(ranges: np.ndarray, expert: np.ndarray) -> np.ndarray:
     """Ratio of the policy's joint ranges to the expert's, mean over joints and complete windows but the first.
 
@@ -252,6 +257,78 @@ def contact_foot_speed(
         speed = np.linalg.norm(np.diff(planar, axis=0), axis=-1) * rate
     valid = np.arange(1, len(planar))[:, None, None] < np.asarray(length)[:, None]
     return _mean(np.where(contact[1:] & contact[:-1] & valid, speed, np.nan), axis=(0, 2))
+
+
+def action_rate(targets: np.ndarray, length: np.ndarray, *, rate: float = RATE) -> np.ndarray:
+    """How fast the joint targets change: mean absolute difference of successive steps times the rate, rad/s.
+
+    Args:
+      targets: ``[T, N, J]`` rad.
+      length: ``[N]`` valid steps.
+      rate: Hz.
+
+    Returns:
+      ``[N]``, NaN for an episode of one step.
+    """
+    return _mean_change(targets, length, order=1) * rate
+
+
+def joint_jerk(joint_velocity: np.ndarray, length: np.ndarray, *, rate: float = RATE) -> np.ndarray:
+    """Mean absolute jerk of the joints, rad/s³: the second difference of their velocities times the squared rate.
+
+    Args:
+      joint_velocity: ``[T, N, J]`` rad/s.
+      length: ``[N]`` valid steps.
+      rate: Hz.
+
+    Returns:
+      ``[N]``, NaN for an episode of fewer than three steps.
+    """
+    return _mean_change(joint_velocity, length, order=2) * rate**2
+
+
+def power(
+    targets: np.ndarray,
+    joint_position: np.ndarray,
+    joint_velocity: np.ndarray,
+    length: np.ndarray,
+    *,
+    stiffness: np.ndarray,
+    damping: np.ndarray,
+    effort: np.ndarray,
+) -> np.ndarray:
+    """Mean mechanical power of the servos, W: the sum over joints of |torque · velocity|.
+
+    The torque is the servo's at the end of each step, ``stiffness · (target - position) - damping · velocity``, at most
+    ``effort`` either way. Braking costs as much as driving, and heat is left out.
+
+    Args:
+      targets: ``[T, N, J]`` rad.
+      joint_position: ``[T, N, J]`` rad.
+      joint_velocity: ``[T, N, J]`` rad/s.
+      length: ``[N]`` valid steps.
+      stiffness: ``[J]`` N m/rad.
+      damping: ``[J]`` N m s/rad.
+      effort: ``[J]`` N m.
+
+    Returns:
+      ``[N]``.
+    """
+    velocity = np.asarray(joint_velocity, np.float64)
+    off = np.asarray(targets, np.float64) - np.asarray(joint_position, np.float64)
+    torque = np.clip(stiffness * off - damping * velocity, -effort, effort)
+    return _mean(_valid(np.abs(torque * velocity).sum(-1, keepdims=True), length), axis=(0, 2))
+
+
+def _mean_change(x: np.ndarray, length: np.ndarray, *, order: int) -> np.ndarray:
+    """Mean absolute difference of that order along the steps of ``x [T, N, J]``, ``[N]``."""
+    x = _valid(np.asarray(x, np.float64), length)
+    return _mean(np.abs(np.diff(x, n=order, axis=0)), axis=(0, 2))
+
+
+def _valid(x: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """``x [T, N, J]`` with NaN after the end of each episode."""
+    return np.where(np.arange(len(x))[:, None, None] < np.asarray(length)[:, None], x, np.nan)
 
 
 def _rows(x: np.ndarray, row: np.ndarray) -> np.ndarray:

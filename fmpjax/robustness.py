@@ -230,7 +230,7 @@ def _cell(trainer: Trainer, case: Case, qpos: np.ndarray, length: np.ndarray, fe
     )
 
 
-def wilson(count: int, total: int) -> tuple[float, float]:
+def wilson(count: float, total: int) -> tuple[float, float]:
     """Wilson's 95 % interval of a share of which ``count`` of ``total`` were seen."""
     share, z2 = count / total, Z**2 / total
     middle, half = share + z2 / 2, Z * np.sqrt((share * (1 - share) + z2 / 4) / total)

@@ -13,11 +13,13 @@ from jaxtyping import Float
 from ott.geometry import geometry
 from ott.problems.linear import linear_problem
 from ott.solvers.linear import acceleration, sinkhorn
+from ott.tools import sinkhorn_divergence
 
 Floats = jax.Array | np.ndarray  # JAX takes both
 
 # TF32 spoils Sinkhorn: costs are differences of large inner products.
 _HIGHEST = jax.lax.Precision.HIGHEST
+DISCREPANCY_THRESHOLD, DISCREPANCY_ITERATIONS = 1e-4, 2000  # marginal error (L1) of its solves; iterations at most [D]
 
 
 def squared_cost(x: Float[Floats, "n d"], y: Float[Floats, "m d"]) -> Float[jax.Array, "n m"]:
@@ -120,6 +122,24 @@ def extension(
 def barycenter(probability: Float[jax.Array, "q m"], targets: Float[jax.Array, "m d"]) -> Float[jax.Array, "q d"]:
     """Mean target sum_j p_j y_j, ``[q, d]``; less x it is the gradient of a dual extension at x."""
     return jnp.matmul(probability, targets, precision=_HIGHEST)
+
+
+@jax.jit
+def discrepancy(
+    x: Float[jax.Array, "n d"], y: Float[jax.Array, "m d"], dimension: jax.Array | float
+) -> Float[jax.Array, ""]:
+    """Debiased Sinkhorn divergence between features ``x [n, D]`` and ``y [m, D]``, at the cross cost's epsilon."""
+    cross = squared_cost(x, y)
+    epsilon = entropy_coefficient(cross, dimension)
+    value, _ = sinkhorn_divergence.sinkhorn_divergence(
+        geometry.Geometry,
+        cross,
+        squared_cost(x, x),
+        squared_cost(y, y),
+        epsilon=epsilon,
+        solve_kwargs={"threshold": DISCREPANCY_THRESHOLD, "max_iterations": DISCREPANCY_ITERATIONS},
+    )
+    return value
 
 
 class ScoreFunction(NamedTuple):

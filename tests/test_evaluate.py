@@ -58,6 +58,11 @@ def test_falls_from_the_fixed_pose_at_every_size_of_noise(fixed, evaluator):
     np.testing.assert_allclose(played.start_qpos, evaluator.start().physics.qpos[:40], atol=1e-7)
     result = evaluator.measure(played)
     assert (result.noise, result.episodes, result.falls, result.starts) == (1e-3, 40, 0, played.starts)
+    # Nothing moves, so the policy asks for one pose; the starts' velocities stay, at which its servos work.
+    asked = fixed.env.actions(np.float32(0.0))
+    assert played.targets.shape == (60, 40, len(asked)) and not np.ptp(played.targets, axis=0).any()
+    np.testing.assert_allclose(played.targets[0], np.tile(asked, (40, 1)), atol=0.2)
+    assert (result.action_rate, result.joint_jerk) == (0.0, 0.0) and 0.0 < result.power < 2.0
     shown = evaluate.table(result)
     assert "0 of 40  joint noise of 0.001 rad at the start" in shown and f"{many.falls} of 14" in shown
     # Columns are named before anything is played.
@@ -183,6 +188,18 @@ def test_late_speed_is_of_the_detailed_episodes(fixed, evaluator):
     assert result.late_n == 64 and result.late_speed == pytest.approx(0.5, abs=1e-4)
     assert result.path_speed == pytest.approx(0.5, abs=1e-4) and result.late_deviation == pytest.approx(0, abs=1e-4)
     assert result.episodes == 100 and result.displacement == pytest.approx((64 * 0.5 + 36 * 3.0) / 100 * 6.0, rel=1e-3)
+
+
+def test_work_is_of_the_detailed_episodes_and_undefined_without_their_targets(fixed, evaluator):
+    """Targets 0.2 rad off the pose while one joint turns at 1 rad/s, in 64 episodes of 65."""
+    played = walking(fixed, np.zeros(65))
+    played.qvel[:, :64, 6], played.qvel[:, 64, 6] = 1.0, 50.0
+    lacking = evaluator.measure(played)
+    assert lacking.joint_jerk == 0.0 and np.isnan([lacking.action_rate, lacking.power]).all()
+    robot = fixed.robot
+    result = evaluator.measure(played._replace(targets=played.qpos[:, :64, 7:] + 0.2))
+    torque = np.clip(0.2 * robot.stiffness[0] - robot.damping[0], -robot.effort[0], robot.effort[0])
+    assert result.power == pytest.approx(abs(torque), rel=1e-4) and result.action_rate == pytest.approx(0, abs=1e-4)
 
 
 def test_discrepancy_is_in_the_papers_features_whatever_the_runs_are(fixed, evaluator):

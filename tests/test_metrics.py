@@ -183,6 +183,32 @@ def test_contact_foot_speed_is_planar_and_counts_only_contact():
     assert np.isnan(metrics.contact_foot_speed(position, np.zeros_like(contact), np.array([4]))).all()
 
 
+def test_action_rate_and_jerk_are_mean_absolute_differences_within_the_episode():
+    """Targets that rise by 0.02 rad a step of 0.02 s; velocities k², whose second difference is 2, over 0.02² s²."""
+    step = np.arange(6.0)
+    targets, velocity = np.zeros((6, 1, 2)), np.zeros((6, 1, 2))
+    targets[:, 0, 0] = 0.02 * step  # 1 rad/s, the other joint none
+    velocity[:, 0, 0] = -(step**2)  # 5,000 rad/s³, the other joint none
+    targets[5] = velocity[5] = np.nan  # after the end
+    length = np.array([5])
+    np.testing.assert_allclose(metrics.action_rate(targets, length), [0.5])
+    np.testing.assert_allclose(metrics.joint_jerk(velocity, length), [2500.0])
+    # Another rate, and episodes that are too short.
+    np.testing.assert_allclose(metrics.action_rate(targets, length, rate=100.0), [1.0])
+    assert np.isnan(metrics.action_rate(targets, np.array([1]))) and np.isnan(metrics.joint_jerk(velocity, [2]))
+
+
+def test_power_is_of_the_servos_torques_either_way():
+    """Torques 10 · 0.3 - 2 · 1 = 1 N m and, past its limit, -5 N m, at 1 and 0.5 rad/s: 1 + 2.5 W, and then nothing."""
+    position, velocity = np.zeros((3, 1, 2)), np.zeros((3, 1, 2))
+    velocity[0, 0] = [1.0, 0.5]
+    velocity[2] = np.nan  # after the end
+    targets = np.tile([0.3, -7.0], (3, 1, 1))
+    servo = {"stiffness": np.array([10.0, 10.0]), "damping": np.array([2.0, 2.0]), "effort": np.array([5.0, 5.0])}
+    found = metrics.power(targets, position, velocity, np.array([2]), **servo)
+    np.testing.assert_allclose(found, [3.5 / 2])
+
+
 @pytest.mark.filterwarnings("error")
 def test_episodes_without_a_window_are_excluded_and_counted():
     # Lengths 10, 60 and 150: none, one and three complete windows; what follows an episode is not a number.

@@ -17,7 +17,6 @@ IMPORTED_AS = {
     "huggingface-hub": "huggingface_hub", "imageio-ffmpeg": "imageio_ffmpeg", "mujoco-mjx": "mujoco",
     "orbax-checkpoint": "orbax", "ott-jax": "ott", "pillow": "PIL",
 }  # fmt: skip
-USED_BY_OTHERS = {"filelock"}  # JAX imports it where it bounds the folder of compiled programs
 
 
 def _name(requirement: str) -> str:
@@ -31,12 +30,12 @@ def test_every_requirement_is_imported_and_pinned():
     optional = project["optional-dependencies"]
     for requirement in [
         *project["dependencies"],
-        *(r for extra in ("viz", "retarget", "deploy", "play", "hub") for r in optional[extra]),
+        *(r for extra in ("viz", "retarget", "deploy", "play", "hub", "benchmark") for r in optional[extra]),
     ]:
         name = _name(requirement)
         module = IMPORTED_AS.get(name, re.match(r"[A-Za-z0-9-]+", requirement)[0])
         imported = re.search(rf"^\s*(import|from) {module}\b|import_module\(\"{module}\"\)", code, re.MULTILINE)
-        assert imported or name in USED_BY_OTHERS, name
+        assert imported, name
         assert name in pinned, name
     assert {_name(requirement) for extra in ("dev", "docs") for requirement in optional[extra]} <= pinned
 

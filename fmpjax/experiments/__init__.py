@@ -9,6 +9,7 @@ from fmpjax.errors import UserError
 STUDIES = {
     "ablate": "Run the matched comparison, and continue it when it is started again.",
     "barycenter": "Measure what the barycentric baseline's first targets keep of the motion.",
+    "benchmark": "Run the benchmark of all methods, and continue it when it is started again.",
     "curvature": "Compare the score and the barycentric reward halfway between two atoms.",
     "generalization": "Fit FMP, Endpoint and Value to a standing policy's windows, and measure them beyond these.",
     "ranking": "Rank the demonstration and spoiled copies of it under a reward fitted to a policy's windows.",

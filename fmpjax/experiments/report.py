@@ -15,8 +15,8 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from fmpjax.errors import UserError
-from fmpjax.experiments import barycenter, curvature, generalization, static_teacher
-from fmpjax.experiments.common import results, table
+from fmpjax.experiments import barycenter, benchmark, curvature, generalization, static_teacher
+from fmpjax.experiments.common import comparison, explorer, results, table
 from fmpjax.experiments.common.results import Table, Verdict
 
 COMPARISON = "results.json"  # of the matched comparison
@@ -33,6 +33,7 @@ class Section(NamedTuple):
     source: Path | None  # file of its figures
     provenance: Mapping[str, Any]
     command: str  # that makes it
+    lines: Sequence[Mapping[str, str]] = ()  # of a table that the page's reader can sort and filter
 
 
 _RUNS = " --run STANDING_RUN --walking WALKING_RUN"
@@ -61,10 +62,24 @@ def gather(folder: Path) -> list[Section]:
             for title, module, needs in _STUDIES
         ),
     ]
+    if (compared := _benchmark(folder)) is not None:
+        sections.append(compared)
     if not any(section.source for section in sections):
-        names = ", ".join([COMPARISON, *(f"{module.NAME}.json" for _, module, _ in _STUDIES)])
+        names = ", ".join([COMPARISON, f"{benchmark.NAME}.json", *(f"{module.NAME}.json" for _, module, _ in _STUDIES)])
         raise UserError(f"no results below {folder}: expected one of {names}")
     return sections
+
+
+def _benchmark(folder: Path) -> Section | None:
+    """The section of the benchmark; None where there is none, as a page on the paper does not miss it."""
+    title = "The benchmark: methods by motions, resets and seeds"
+    found = _section(
+        folder, title, benchmark.NAME, "", f"{benchmark.NAME}.json", f"{benchmark.NAME}.png",
+        lambda record: (comparison.table(record), []),
+    )  # fmt: skip
+    if found.source is None:
+        return None
+    return found._replace(lines=explorer.read(found.source.with_suffix(".csv")))
 
 
 def _section(
@@ -145,7 +160,7 @@ def page(sections: Sequence[Section], videos: Sequence[Path], root: Path) -> str
     parts = [
         "<!doctype html>", '<html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">', f"<title>{_TITLE}</title>",
-        f"<style>{_STYLE}</style></head><body>", f"<h1>{_TITLE}</h1>", f"<p>{_lead(sections)}</p>",
+        f"<style>{_STYLE}{explorer.STYLE}</style></head><body>", f"<h1>{_TITLE}</h1>", f"<p>{_lead(sections)}</p>",
     ]  # fmt: skip
     for section in sections:
         parts.append(f"<h2>{html.escape(section.title)}</h2>")
@@ -155,6 +170,8 @@ def page(sections: Sequence[Section], videos: Sequence[Path], root: Path) -> str
         parts += [_html_table(section.table), '<ul class="verdicts">', *map(_html_verdict, section.verdicts), "</ul>"]
         if section.picture:
             parts.append(f'<img alt="{html.escape(section.title)}" src="{_data(section.picture, "image/png")}">')
+        if section.lines:
+            parts.append(explorer.page(section.lines))
         parts.append(f'<p class="source">{_source(section, root, html.escape, "<code>{}</code>".format)}</p>')
     parts.append("<h2>Videos</h2>")
     left = VIDEO_LIMIT
@@ -168,6 +185,8 @@ def page(sections: Sequence[Section], videos: Sequence[Path], root: Path) -> str
             parts.append(f"<figure>{shown}<figcaption>{name}</figcaption></figure>")
     if not videos:
         parts.append("<p>There are none below this folder.</p>")
+    if any(section.lines for section in sections):
+        parts.append(explorer.script())
     return "\n".join([*parts, "</body></html>"])
 
 

@@ -7,11 +7,6 @@ alone, and one of another configuration is refused.
 
 import dataclasses
 import itertools
-import os
-import shutil
-import signal
-import subprocess
-import sys
 import time
 import tomllib
 from collections import Counter
@@ -23,9 +18,12 @@ from fmpjax import config as configuration
 from fmpjax import priors
 from fmpjax.config import Config
 from fmpjax.errors import UserError
-from fmpjax.logs import MetricsLog, Progress, clock
+from fmpjax.experiments.common import engines, work
+from fmpjax.experiments.common.work import Task
+from fmpjax.logs import Progress, clock
 
 _POLL = 1.0  # s between looks at the running cells
+_LISTED = 4  # running cells at most of which a line shows the progress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +39,7 @@ class Specification:
     seeds: tuple[int, ...] = (0,)
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # section.field: value, of every cell
     variants: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # by name, of its cells
+    by_method: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # settings of its cells
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +96,7 @@ def _check(path: Path, key: str, value: Any) -> None:
         good, expected = isinstance(value, list) and all(type(v) is int for v in value), "a list of whole numbers"
     elif key == "settings":
         good, expected = isinstance(value, dict), "a table of section.field = value"
-    elif key == "variants":
+    elif key in ("variants", "by_method"):
         good = isinstance(value, dict) and all(isinstance(v, dict) for v in value.values())
         expected = "tables of section.field = value"
     elif key == "transitions":
@@ -123,7 +122,7 @@ def plan(specification: Specification) -> list[Cell]:
         changes: dict[str, Any] = {"motion": s.motion, "method": method, "env.reset": reset, "seed": seed}
         changes |= {"frames": s.frames} if s.frames else {}
         changes |= {"transitions": s.transitions} if s.transitions else {}
-        changes |= {**s.settings, **variants[variant]}
+        changes |= {**s.settings, **s.by_method.get(method, {}), **variants[variant]}
         group = "-".join(part for part in (method, reset, variant) if part)
         cells.append(Cell(f"{group}/seed{seed}", variant, configuration.preset(s.preset, **changes), changes))
     if not cells:
@@ -149,22 +148,27 @@ def finished(cell: Cell, folder: Path) -> bool:
     for key, value in configuration.flatten(cell.config).items():
         if saved[key] != value:
             raise UserError(f"{run} holds a run with {key} {saved[key]!r}, not {value!r}: name another --out")
-    return (run / "evaluation.json").exists() and _done(cell, folder) >= cell.config.iterations
+    return work.ended(run, cell.config.iterations)
 
 
-def _done(cell: Cell, folder: Path) -> int:
-    rows = MetricsLog.read(folder / cell.name / "metrics.csv")
-    return int(rows[-1]["iteration"]) if rows else 0
-
-
-def run(cells: Sequence[Cell], folder: Path, workers: int = 1, *, together: bool = False) -> None:
+def run(
+    cells: Sequence[Cell],
+    folder: Path,
+    workers: int = 1,
+    *,
+    together: bool = False,
+    cluster: str = "none",
+    options: Sequence[str] = (),
+) -> None:
     """Run what is not finished yet, ``workers`` at once.
 
     Args:
       cells: of one plan.
       folder: where their run folders are.
-      workers: processes at once, each on its share of the cores.
+      workers: processes at once; on one machine each has its share of the cores.
       together: train all seeds of a group in one process as one program, which pays on an accelerator.
+      cluster: where they run, as `engines.make` takes it.
+      options: of the cluster.
 
     Raises:
       UserError: a folder holds another configuration (before anything runs), or cells failed (after all others ran).
@@ -172,125 +176,60 @@ def run(cells: Sequence[Cell], folder: Path, workers: int = 1, *, together: bool
     todo = [cell for cell in cells if not finished(cell, folder)]
     progress = Progress(30.0)
     progress.note(f"{len(cells)} cells, {len(cells) - len(todo)} of them finished before")
-    shares = _shares(workers)
-    waiting = _jobs(todo, folder, together)
-    running: dict[int, _Job] = {}
-    failed: list[_Job] = []
-    began, before = time.monotonic(), {cell.name: _done(cell, folder) for cell in todo}
-    total = sum(cell.config.iterations - before[cell.name] for cell in todo)
+    waiting, failed = _tasks(todo, folder, together), []
+    engine = engines.make(cluster, workers, folder, len(waiting), options)
+    began, begun, ended = time.monotonic(), {}, 0
+    before = {cell.name: work.iterations(folder / cell.name) for cell in todo}
+    done, total = dict(before), sum(cell.config.iterations for cell in todo) - sum(before.values())
     try:
-        while waiting or running:
-            for index in set(range(len(shares))) - set(running):
-                if waiting:
-                    running[index] = waiting.pop(0)
-                    running[index].start(folder, shares[index])
-                    progress.note(f"{running[index].name} begins, log in {running[index].log(folder)}")
+        while waiting or engine.running():
+            for task in engine.start(waiting):
+                begun[task.cells] = time.monotonic()
+                progress.note(f"{_name(task)} begins, log in {task.log}")
             time.sleep(_POLL)
-            for index, job in list(running.items()):
-                if job.process is None or job.process.poll() is None:
-                    continue
-                del running[index]
-                good = job.process.returncode == 0 and all(finished(cell, folder) for cell in job.cells)
-                failed += [] if good else [job]
-                progress.note(f"{job.name} {'is done' if good else 'FAILED'} after {clock(job.seconds)}")
+            now = engine.running()
+            for task in engine.ended():
+                good = all(work.ended(folder / name, task.iterations) for name in task.cells)
+                failed += [] if good else [task]
+                ended += len(task.cells) if good else 0
+                took = clock(time.monotonic() - begun[task.cells])
+                progress.note(f"{_name(task)} {'is done' if good else 'FAILED'} after {took}")
+            done |= {name: work.iterations(folder / name) for task in now for name in task.cells}
             # Work is counted in iterations; the rate so far gives the time left.
-            done = sum(_done(cell, folder) - before[cell.name] for cell in todo)
-            left = clock((time.monotonic() - began) * (total - done) / done) if done > 0 else "unknown time"
-            now = ", ".join(f"{job.name} {100 * job.share(folder):.0f} %" for job in running.values())
-            progress.show(f"{sum(finished(c, folder) for c in todo)} of {len(todo)} done | {now} | {left} left")
+            new = sum(done.values()) - sum(before.values())
+            left = clock((time.monotonic() - began) * (total - new) / new) if new > 0 else "unknown time"
+            parts = ", ".join(f"{_name(task)} {_share(task, done):.0%}" for task in engine.running()[:_LISTED])
+            progress.show(f"{ended} of {len(todo)} done | {parts} | {left} left")
     finally:
-        begun = [job.process for job in running.values() if job.process]
-        for process in begun:
-            process.send_signal(signal.SIGTERM)
-        for process in begun:
-            process.wait()
+        engine.stop()
     if failed:
-        names = ", ".join(job.name for job in failed)
-        raise UserError(f"{len(failed)} of the cells failed: see {failed[0].log(folder)} ({names})")
+        names = ", ".join(map(_name, failed))
+        raise UserError(f"{len(failed)} of the cells failed: see {failed[0].log} ({names})")
 
 
-@dataclasses.dataclass
-class _Job:
-    """Cells of one process."""
-
-    cells: list[Cell]
-    process: subprocess.Popen | None = None
-    began: float = 0.0
-
-    @property
-    def name(self) -> str:
-        return self.cells[0].name if len(self.cells) == 1 else f"{self.cells[0].group} ({len(self.cells)} seeds)"
-
-    @property
-    def seconds(self) -> float:
-        return time.monotonic() - self.began
-
-    def share(self, folder: Path) -> float:
-        """Share of the budget that is spent."""
-        return sum(_done(cell, folder) for cell in self.cells) / sum(cell.config.iterations for cell in self.cells)
-
-    def log(self, folder: Path) -> Path:
-        return folder / f"{self.cells[0].name}.log"
-
-    def start(self, folder: Path, cores: set[int]) -> None:
-        """Begin, or continue where an earlier process was killed."""
-        first = self.cells[0]
-        begun = all((folder / cell.name / "config.json").exists() for cell in self.cells)
-        if not begun:
-            # A process that was killed while it made the folders left them behind: `_jobs` has seen that nothing more
-            # than a beginning is in them.
-            for cell in self.cells:
-                shutil.rmtree(folder / cell.name, ignore_errors=True)
-        if len(self.cells) == 1:
-            where = ["--run", str(folder / first.name)]
-        else:
-            where = ["--run", str(folder / first.group), "--seeds", str(len(self.cells))]
-        arguments = [*first.command, *where, *(["--resume"] if begun else [])]
-        self.log(folder).parent.mkdir(parents=True, exist_ok=True)
-        self.began = time.monotonic()
-        with self.log(folder).open("a") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-c", _LAUNCH, ",".join(map(str, sorted(cores))), *arguments],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,  # a Ctrl-C reaches the cells through us, once
-            )
+def _name(task: Task) -> str:
+    first = task.cells[0]
+    return first if len(task.cells) == 1 else f"{first.partition('/')[0]} ({len(task.cells)} seeds)"
 
 
-def _jobs(todo: Sequence[Cell], folder: Path, together: bool) -> list[_Job]:
-    """Processes for the cells to do; together, consecutive seeds of a group that have got as far are one."""
-    if not together:
-        return [_Job([cell]) for cell in todo]
-    jobs: list[_Job] = []
-    for cell in sorted(todo, key=lambda cell: cell.config.seed):
-        for job in jobs:
-            last = job.cells[-1]
+def _share(task: Task, done: Mapping[str, int]) -> float:
+    """Share of the budget that is spent, given each cell's iterations."""
+    return sum(done[name] for name in task.cells) / (len(task.cells) * task.iterations)
+
+
+def _tasks(todo: Sequence[Cell], folder: Path, together: bool) -> list[Task]:
+    """Tasks for the cells to do; together, consecutive seeds of a group that have got as far are one."""
+    groups: list[list[Cell]] = []
+    for cell in sorted(todo, key=lambda cell: cell.config.seed) if together else todo:
+        for group in groups if together else ():
+            last = group[-1]
             follows = last.group == cell.group and cell.config.seed == last.config.seed + 1
-            if follows and _done(last, folder) == _done(cell, folder):
-                job.cells.append(cell)
+            if follows and work.iterations(folder / last.name) == work.iterations(folder / cell.name):
+                group.append(cell)
                 break
         else:
-            jobs.append(_Job([cell]))
-    return jobs
-
-
-def _shares(workers: int) -> list[set[int]]:
-    """Cores of each worker; workers beyond the cores share them."""
-    if workers < 1:
-        raise UserError(f"--workers is {workers}: expected at least 1")
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    if len(cores) < workers:
-        return [set(cores)] * workers
-    return [set(cores[i::workers]) for i in range(workers)]
-
-
-# XLA counts its threads by the cores that a process may use, so they are set before it is imported.
-_LAUNCH = """
-import os, sys
-cores = set(map(int, sys.argv[1].split(","))) if sys.argv[1] else set()
-if cores:
-    os.sched_setaffinity(0, cores)
-del sys.argv[1]
-from fmpjax.cli import main
-main(sys.argv[1:])
-"""
+            groups.append([cell])
+    return [
+        Task(str(folder), tuple(c.name for c in group), group[0].config.iterations, tuple(group[0].command))
+        for group in groups
+    ]

@@ -242,7 +242,7 @@ def write(cells: Sequence[Cell], folder: Path, places: Iterable[Path | str] = ()
     flat = [{k: v for k, v in dataclasses.asdict(r).items() if k != "figures"} | r.figures for r in rows]
     motions = [name for cell in cells for name, _ in library.parse(cell.config.motion)]
     # The cells may have been trained by other versions than the one that writes this.
-    runs = {cell.name: _origin(folder / cell.name / "provenance.json") for cell in cells}
+    runs = {cell.name: origin(folder / cell.name) for cell in cells}
     results.save(folder, "results", {"runs": runs, "evaluations": flat}, flat, {folder, *places, *motions})
     (folder / "table.md").write_text("\n\n".join([markdown(final), *notes(final)]) + "\n")
     (folder / "table.tex").write_text(latex(final) + "\n")
@@ -273,8 +273,9 @@ def notes(final: Sequence[Row]) -> list[str]:
     return found
 
 
-def _origin(path: Path) -> dict[str, Any]:
-    made = json.loads(path.read_text())
+def origin(run: Path) -> dict[str, Any]:
+    """Commit, date and device of a run."""
+    made = json.loads((run / "provenance.json").read_text())
     return {key: made[key] for key in ("commit", "uncommitted_changes", "date", "device")}
 
 

@@ -1,0 +1,160 @@
+"""Scores of the cells of a benchmark: of each cell's evaluation at equal transitions, and of that at equal wall time.
+
+A run's course has both, since every evaluation says how many transitions and how many seconds of training it is after.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fmpjax.evaluate import pace_error
+from fmpjax.experiments.common import table
+from fmpjax.experiments.common.cells import Cell
+from fmpjax.experiments.common.table import Row
+
+WALKS_WITHIN = 0.2  # relative error of the pace at most, of a policy that walks; none of its episodes may fall
+
+
+class Score(NamedTuple):
+    """A figure by which methods are compared."""
+
+    name: str
+    heading: str  # with its unit
+    digits: int
+    better: int  # 1 where more is better, -1 where less is
+
+
+SCORES = (
+    Score("quality", "quality", 3, 1),
+    Score("walks", "walks, %", 0, 1),
+    Score("falls", "falls, %", 1, -1),
+    Score("pace_error", "pace error", 3, -1),
+    Score("excursion_error", "excursion error", 3, -1),
+    Score("amplitude_error", "amp. error, °", 2, -1),
+    Score("sinkhorn", "Sinkhorn", 3, -1),
+    Score("foot_slip", "foot slip, m/s", 3, -1),
+    Score("action_rate", "action rate, rad/s", 2, -1),
+    Score("joint_jerk", "joint jerk, rad/s³", 0, -1),
+    Score("power", "power, W", 0, -1),
+)
+BUDGETS = ("transitions", "seconds")  # what is equal
+
+
+class Course(NamedTuple):
+    """A finished cell: its evaluations and what else its scores need."""
+
+    cell: Cell
+    rows: list[Row]
+    still: float  # degrees, amplitude error of a robot that holds still: the demonstration's own joint ranges
+    machines: frozenset[str]  # that trained it
+
+
+class Result(NamedTuple):
+    """The scores of one cell at one budget."""
+
+    method: str
+    reset: str
+    motion: str
+    seed: int
+    budget: str  # what is equal: transitions or seconds
+    transitions: int
+    seconds: float  # of training
+    scores: dict[str, float]
+    walk_transitions: float  # until it first walks; NaN where it does not
+    walk_seconds: float
+
+    def line(self) -> dict[str, Any]:
+        """A line of the CSV file."""
+        return {k: v for k, v in self._asdict().items() if k != "scores"} | self.scores
+
+
+def read(cell: Cell, folder: Path) -> Course:
+    """The course of a finished cell."""
+    run = folder / cell.name
+    made = json.loads((run / "provenance.json").read_text())
+    ranges = json.loads((run / "evaluation.json").read_text())["expert_ranges"]
+    machines = frozenset(f"{each['device']}" for each in (made, *made.get("resumed", [])))
+    return Course(cell, table.evaluations(cell, folder), float(np.mean(ranges)), machines)
+
+
+def walks(row: Row) -> bool:
+    """Whether no episode of an evaluation falls and its pace is within a fifth of the demonstration's."""
+    return row.figure("falls") == 0 and pace_error(row.figures) <= WALKS_WITHIN
+
+
+def time_to_walk(rows: Sequence[Row]) -> tuple[float, float]:
+    """Transitions, and seconds of training, until the first evaluation that walks; NaN where none does."""
+    return next(((float(row.transitions), row.seconds) for row in rows if walks(row)), (math.nan, math.nan))
+
+
+def scores(row: Row, still: float) -> dict[str, float]:
+    """The scores of one evaluation, by name.
+
+    A pace, an excursion or an amplitude that no episode lasts long enough to have is that of a robot that holds still,
+    so that a method gains nothing by falling early. The other scores are NaN where they are not defined.
+
+    Args:
+      row: of a cell.
+      still: amplitude error of a robot that holds still, degrees.
+    """
+    excursion, amplitude = row.figure("excursion"), row.figure("amplitude_mae")
+    return {
+        "quality": row.figure("quality"),
+        "walks": 100.0 * walks(row),
+        "falls": row.figure("falls"),
+        "pace_error": pace_error(row.figures),
+        "excursion_error": 1.0 if math.isnan(excursion) else abs(excursion - 1.0),
+        "amplitude_error": still if math.isnan(amplitude) else amplitude,
+        "sinkhorn": row.figure("discrepancy"),
+        "foot_slip": row.figure("contact_foot_speed"),
+        "action_rate": row.figure("action_rate"),
+        "joint_jerk": row.figure("joint_jerk"),
+        "power": row.figure("power"),
+    }
+
+
+def machines(courses: Sequence[Course]) -> list[str]:
+    """The kinds of machine that trained the cells; wall times of several kinds do not compare."""
+    return sorted({machine for course in courses for machine in course.machines})
+
+
+def results(courses: Sequence[Course]) -> list[Result]:
+    """The scores of every cell at equal transitions and, where one kind of machine trained all, at equal wall time.
+
+    At equal transitions the last evaluation counts. At equal wall time it is, for each motion and reset, the evaluation
+    nearest to the mean time in which the fastest method spends its budget.
+    """
+    found = [_result(course, course.rows[-1], "transitions") for course in courses]
+    if len(machines(courses)) != 1:
+        return found
+    limits = _limits(courses)
+    for course in courses:
+        limit = limits[_where(course)]
+        nearest = min(course.rows, key=lambda row: abs(row.seconds - limit))
+        found.append(_result(course, nearest, "seconds"))
+    return found
+
+
+def _result(course: Course, row: Row, budget: str) -> Result:
+    until = [each for each in course.rows if each.transitions <= row.transitions]
+    return Result(
+        row.method, row.reset, row.variant, row.seed, budget, row.transitions, row.seconds,
+        scores(row, course.still), *time_to_walk(until),
+    )  # fmt: skip
+
+
+def _where(course: Course) -> tuple[str, str]:
+    return course.cell.variant, course.cell.config.env.reset
+
+
+def _limits(courses: Sequence[Course]) -> Mapping[tuple[str, str], float]:
+    """Seconds of training that are equal, for each motion and reset."""
+    spent: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for course in courses:
+        methods = spent.setdefault(_where(course), {})
+        methods.setdefault(course.cell.config.method, []).append(course.rows[-1].seconds)
+    return {where: min(float(np.mean(times)) for times in methods.values()) for where, methods in spent.items()}

@@ -1,0 +1,112 @@
+"""What the process of a cell does: train its run, or continue it, unless another process does so or it is finished.
+
+The module imports no JAX, so that the process is on its cores before XLA counts them.
+"""
+
+import contextlib
+import dataclasses
+import importlib
+import os
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from filelock import FileLock, Timeout
+
+from fmpjax.errors import UserError
+from fmpjax.logs import MetricsLog
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """Cells that one process trains: one, or the consecutive seeds of a group at once.
+
+    submitit pickles it, calls it on a node of the cluster, and calls `checkpoint` where its time there is up.
+    """
+
+    folder: str  # of all cells
+    cells: tuple[str, ...]  # their names, which are their run folders
+    iterations: int  # of each cell's budget
+    arguments: tuple[str, ...]  # of `fmpjax train`, but for the run's folder
+    cores: tuple[int, ...] = ()  # to run on; none for all
+
+    @property
+    def log(self) -> Path:
+        return Path(self.folder) / f"{self.cells[0]}.log"
+
+    def __call__(self) -> None:
+        """`run`, in a process of its own, all of whose output goes into the log."""
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("a") as log:
+            for stream in (sys.stdout, sys.stderr):
+                stream.flush()
+                os.dup2(log.fileno(), stream.fileno())
+        self.run()
+
+    def run(self) -> None:
+        """Train the cells to their end, where they are not there yet.
+
+        Raises:
+          UserError: another process has one of the cells.
+          ChildProcessError: the training failed, or was stopped; the log says why.
+        """
+        with contextlib.ExitStack() as locks:
+            for name in self.cells:
+                path = Path(self.folder) / f"{name}.lock"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    locks.enter_context(FileLock(path).acquire(timeout=0))
+                except Timeout:
+                    raise UserError(f"cell {name} is being run by another process: wait for its end") from None
+            if not all(ended(Path(self.folder) / name, self.iterations) for name in self.cells):
+                self._train()
+
+    def checkpoint(self) -> Any:
+        """For submitit: the same task again, which continues from the run's checkpoint."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self)
+
+    def _train(self) -> None:
+        if self.cores:
+            os.sched_setaffinity(0, self.cores)
+        folders = [Path(self.folder) / name for name in self.cells]
+        begun = all((folder / "config.json").exists() for folder in folders)
+        if not begun:
+            # A process that was killed while it made the folders left no more than a beginning in them.
+            for folder in folders:
+                shutil.rmtree(folder, ignore_errors=True)
+        where = ["--run", str(folders[0])]
+        if len(folders) > 1:
+            where = ["--run", str(folders[0].parent), "--seeds", str(len(folders))]
+        arguments = [*self.arguments, *where, *(["--resume"] if begun else [])]
+        sys.argv = ["fmpjax", *arguments]  # what the run's provenance names
+        with contextlib.suppress(SystemExit):  # the log says why, and the run has not ended
+            importlib.import_module("fmpjax.cli").main(arguments)  # by its name: commands are above studies
+        if not all(ended(folder, self.iterations) for folder in folders):
+            raise ChildProcessError(f"{self.cells[0]} did not come to its end: see {self.log}")
+
+
+def iterations(run: Path) -> int:
+    """Iterations of a run so far."""
+    rows = MetricsLog.read(run / "metrics.csv")
+    return int(rows[-1]["iteration"]) if rows else 0
+
+
+def ended(run: Path, budget: int) -> bool:
+    """Whether a run has spent its budget of iterations and been evaluated."""
+    return (run / "evaluation.json").exists() and iterations(run) >= budget
+
+
+def main(text: str) -> None:
+    """Entry point of a process on this machine: a task as JSON."""
+    msgspec.json.decode(text, type=Task)()
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1])
+    except (UserError, ChildProcessError) as error:
+        sys.exit(f"fmpjax: {error}")

@@ -1,0 +1,284 @@
+"""The benchmark: its plan, cells that survive a kill and run once, here and on a cluster, and a prior that joins."""
+
+import csv
+import importlib.util
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from filelock import FileLock
+
+from fmpjax import config as configuration
+from fmpjax import priors
+from fmpjax.errors import UserError
+from fmpjax.experiments import benchmark
+from fmpjax.experiments.common import cells, engines
+from fmpjax.experiments.common.cells import Specification
+from fmpjax.experiments.common.work import Task
+from tests.helpers import TINY
+
+SMALL = {key: ",".join(map(str, v)) if isinstance(v, tuple) else v for key, v in TINY.items()}
+needs_submitit = pytest.mark.skipif(
+    importlib.util.find_spec("submitit") is None, reason="the extra benchmark is not installed"
+)
+
+
+def small(*methods, motions=("walk",), seeds=(0,)):
+    settings = {**benchmark.SETTINGS, **SMALL}
+    specification = Specification(preset="smoke", methods=methods, resets=("dataset",), seeds=seeds, settings=settings)
+    return benchmark.plan(specification, motions)
+
+
+# --- the plan --------------------------------------------------------------------------------------------------------
+
+
+def test_all_methods_have_one_setting_for_all_motions():
+    planned = benchmark.plan(
+        Specification(preset="laptop", methods=priors.METHODS, seeds=(0, 1), settings=benchmark.SETTINGS),
+        benchmark.MOTIONS,
+    )
+    assert len(planned) == len(priors.METHODS) * 4 * 2 * 2
+    configs = [configuration.flatten(cell.config) for cell in planned]
+    apart = {key for key in configs[0] if len({str(config[key]) for config in configs}) > 1}
+    assert apart == {"method", "motion", "seed", "env.reset"}
+    assert planned[0].name == f"{priors.METHODS[0]}-dataset-walk/seed0" and planned[0].config.features.axes == "heading"
+    assert len(planned[0].config.evaluations) == 10
+
+
+def test_what_a_method_needs_holds_on_every_motion(monkeypatch):
+    monkeypatch.setattr(benchmark, "METHOD_SETTINGS", {"amp": {"amp.updates": 7}})
+    planned = small("fmp", "amp", motions=("walk", "slow_walk"))
+    assert [cell.config.amp.updates for cell in planned if cell.config.method == "amp"] == [7, 7]
+    assert [cell.config.amp.updates for cell in planned if cell.config.method == "fmp"] == [2, 2]
+
+
+def test_motions_of_ones_own_join_the_default_ones(tmp_path):
+    from fmpjax import motion
+
+    mine = motion.save(motion.load("slow_walk"), tmp_path / "mine.npz")
+    assert [cell.variant for cell in small("fmp", motions=("walk", str(mine)))] == ["walk", "mine"]
+    for motions, said in (
+        ((), "--only leaves out the default motions: expected a --motion at least"),
+        (("walk", str(tmp_path / "none.npz")), "none.npz"),
+        (("mine.npz", str(mine)), "motions 'mine.npz' and '.*mine.npz' are both called 'mine': expected two names"),
+    ):
+        with pytest.raises(UserError, match=said):
+            small("fmp", motions=motions)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--set", "method=amp"], "--set 'method=amp': expected section.field=value, of a setting that all cells"),
+        (["--set", "amp.updates"], "--set 'amp.updates': expected section.field=value"),
+        (["--cluster", "lsf"], "--cluster is 'lsf': expected one of none, local, slurm"),
+        (["--slurm", "partition=gpu"], "--slurm partition=gpu goes with --cluster slurm, not none"),
+        (["--workers", "0"], "--workers is 0: expected at least 1"),
+        (["--methods", "gan"], "unknown method 'gan'"),
+    ],
+)
+def test_bad_options_are_refused_before_anything_runs(tmp_path, capsys, options, said):
+    with pytest.raises(SystemExit) as exit_:
+        benchmark.cli(["--smoke", "--out", str(tmp_path / "out"), *options])
+    assert exit_.value.code == 2 and said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+# --- a cell runs once ------------------------------------------------------------------------------------------------
+
+
+def task(folder, name="fmp-dataset-walk/seed0", finished=True):
+    """A task of a cell that has spent its budget of ten iterations, and may have been evaluated."""
+    run = folder / name
+    run.mkdir(parents=True, exist_ok=True)
+    (run / "metrics.csv").write_text("iteration,transitions,seconds\n10,640,3.0\n")
+    if finished:
+        (run / "evaluation.json").write_text("{}")
+    return Task(str(folder), (name,), 10, ("--bad-option",))
+
+
+def test_a_finished_cell_is_not_run_again(tmp_path, monkeypatch):
+    trained = []
+    monkeypatch.setattr(Task, "_train", lambda self: trained.append(self.cells))
+    task(tmp_path).run()
+    assert not trained
+    task(tmp_path, "fmp-dataset-walk/seed1", finished=False).run()
+    assert trained == [("fmp-dataset-walk/seed1",)]
+
+
+def test_a_cell_that_another_process_has_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(Task, "_train", lambda self: pytest.fail("it was run"))
+    mine = task(tmp_path, finished=False)
+    with FileLock(tmp_path / "fmp-dataset-walk" / "seed0.lock"):
+        with pytest.raises(UserError, match="cell fmp-dataset-walk/seed0 is being run by another process: wait"):
+            mine.run()
+
+
+def test_a_process_that_ends_before_its_cell_has_failed(tmp_path):
+    """The log says why, and the engine's process ends badly."""
+    engine, waiting = engines.Processes(1), [task(tmp_path, finished=False), task(tmp_path, "fmp/seed1")]
+    (begun,) = engine.start(waiting)
+    assert len(waiting) == 1 and engine.running() == [begun] and begun.cores
+    assert engine.start(waiting) == []  # one place, which is taken
+    until = time.monotonic() + 60
+    while not (over := engine.ended()) and time.monotonic() < until:
+        time.sleep(0.1)
+    assert over == [begun] and engine.running() == []
+    assert "did not come to its end: see" in begun.log.read_text() and "--bad-option" in begun.log.read_text()
+
+
+def test_shares_are_even_and_all_of_the_cores(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2, 3, 4}, raising=False)
+    assert engines.shares(2) == [{0, 2, 4}, {1, 3}]
+    assert engines.shares(6) == [{0, 1, 2, 3, 4}] * 6
+
+
+# --- submitit --------------------------------------------------------------------------------------------------------
+
+
+def test_a_cluster_without_submitit_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    with pytest.raises(UserError, match=re.escape("--cluster local needs submitit, which is not installed")):
+        engines.make("local", 1, tmp_path, 1)
+
+
+@needs_submitit
+def test_submitit_runs_a_finished_and_a_failing_cell(tmp_path):
+    good, bad = task(tmp_path), task(tmp_path, "amp-dataset-walk/seed0", finished=False)
+    engine, waiting, over = engines.make("local", 2, tmp_path, 2), [good, bad], []
+    assert len(engine.start(waiting)) == 2 and not waiting
+    until = time.monotonic() + 120
+    while engine.running() and time.monotonic() < until:
+        over += engine.ended()
+        time.sleep(0.2)
+    assert {each.cells for each in over} == {good.cells, bad.cells}
+    assert "amp-dataset-walk/seed0 did not come to its end" in bad.log.read_text()
+    assert bad.checkpoint().function == bad  # where its time is up, the same again
+
+
+@needs_submitit
+def test_bad_options_of_slurm_and_no_slurm_are_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match="--cluster slurm with --slurm a=1 cannot be used: .*srun"):
+        engines.make("slurm", 1, tmp_path, 1, ["a=1"])
+    with pytest.raises(UserError, match=re.escape("--slurm has 'gpu': expected NAME=VALUE")):
+        engines.make("slurm", 1, tmp_path, 1, ["gpu"])
+
+
+SBATCH = """#!/bin/bash
+# Stands in for SLURM: runs each task of the array after the other.
+cp "$1" "$(dirname "$0")/submitted.sh"
+count=$(grep -oP '#SBATCH --array=0-\\K[0-9]+' "$1")
+for i in $(seq 0 "$count"); do
+  SLURM_ARRAY_JOB_ID=7 SLURM_ARRAY_TASK_ID=$i SLURM_JOB_ID=$((8 + i)) SLURM_NTASKS=1 SLURM_JOB_NUM_NODES=1 \\
+    SLURM_NODEID=0 SLURM_PROCID=0 SLURM_LOCALID=0 bash "$1" < /dev/null >> "$(dirname "$0")/nodes.log" 2>&1 &
+done
+echo "Submitted batch job 7"
+"""
+SRUN = """#!/bin/bash
+while [[ "$1" == --* || "$1" != *python* ]]; do shift; done
+exec "$@"
+"""
+
+
+@needs_submitit
+def test_slurm_gets_one_array_of_all_cells(tmp_path, monkeypatch):
+    """A stand-in for SLURM runs the array's tasks; both cells are finished ones."""
+    for name, text in (("sbatch", SBATCH), ("srun", SRUN), ("sacct", "#!/bin/bash\n"), ("scancel", "#!/bin/bash\n")):
+        path = tmp_path / "bin" / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+        path.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    out = tmp_path / "out"
+    waiting = [task(out), task(out, "amp-dataset-walk/seed0")]
+    engine = engines.make("slurm", 1, out, 2, ["partition=gpu", "timeout_min=90"])
+    assert len(engine.start(waiting)) == 2
+    until, over = time.monotonic() + 120, []
+    while engine.running() and time.monotonic() < until:
+        over += engine.ended()
+        time.sleep(0.2)
+    script = (tmp_path / "bin" / "submitted.sh").read_text()
+    assert len(over) == 2, (tmp_path / "bin" / "nodes.log").read_text()
+    for option in ("--array=0-1%1", "--partition=gpu", "--time=90", "--job-name=fmpjax"):
+        assert f"#SBATCH {option}" in script
+    assert [each.log.exists() for each in over] == [True, True]
+
+
+# --- from the plan to the page ---------------------------------------------------------------------------------------
+
+
+PRIOR = '''"""A reward of one for every state that is finite."""
+
+import jax.numpy as jnp
+
+from fmpjax.priors import MotionPrior
+
+
+def make(expert, config):
+    """One, whatever the robot does."""
+
+    def update(state, rollout, key):
+        return state, jnp.where(rollout.valid, 1.0, 0.0), {}
+
+    return MotionPrior(lambda key: (), update, lambda state, features: jnp.zeros(len(features)))
+'''
+
+
+@pytest.mark.slow
+def test_a_new_prior_is_one_file_and_one_line(tmp_path, monkeypatch):
+    """Its cells are planned, trained, scored and compared as those of every method."""
+    monkeypatch.setattr(priors, "_REGISTRY", dict(priors._REGISTRY))
+    monkeypatch.setattr(sys, "argv", list(sys.argv))
+    (tmp_path / "constant.py").write_text(PRIOR)
+    monkeypatch.syspath_prepend(tmp_path)
+    constant = __import__("constant")
+    priors.register("constant", constant.make)
+
+    planned = small("constant")
+    for each in cells._tasks(planned, tmp_path / "out", together=False):
+        each.run()
+    paths = benchmark.write(planned, tmp_path / "out")
+    assert all(path.stat().st_size for path in paths)
+    with (tmp_path / "out" / "benchmark.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert [(x["method"], x["motion"], x["budget"]) for x in lines] == [
+        ("constant", "walk", "transitions"), ("constant", "walk", "seconds"),
+    ]  # fmt: skip
+    assert float(lines[0]["power"]) > 0 and float(lines[0]["action_rate"]) > 0 and float(lines[0]["joint_jerk"]) > 0
+    record = json.loads((tmp_path / "out" / "benchmark.json").read_text())
+    assert record["plan"]["methods"] == ["constant"] and record["cells"] == {"planned": 1, "finished": 1}
+    assert str(tmp_path) not in json.dumps(record)
+    assert "dataset, equal transitions: constant" in (tmp_path / "out" / "benchmark.md").read_text()
+
+
+@pytest.mark.slow
+@needs_submitit
+def test_a_killed_cell_continues_to_the_same_end(tmp_path):
+    """The benchmark and its cell are killed; the same command brings the cell to its end, and then does nothing."""
+    out = tmp_path / "out"
+    settings = [f"--set={key}={value}" for key, value in SMALL.items()]
+    command = [
+        sys.executable, "-m", "fmpjax.experiments.benchmark", "--smoke", "--out", str(out), "--only",
+        "--motion", "walk", "--methods", "barycentric", "--seeds", "0", *settings, "--cluster", "local",
+    ]  # fmt: skip
+    run = out / "barycentric-dataset-walk" / "seed0"
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    until = time.monotonic() + 300
+    while not (run / "checkpoints").exists() and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)  # and with it submitit's processes
+    process.wait()
+    assert not (out / "benchmark.csv").exists()
+    for said in ("1 cells, 0 of them finished before", "1 cells, 1 of them finished before"):
+        stamp = run.stat().st_mtime_ns
+        done = subprocess.run(command, capture_output=True, text=True, timeout=280)
+        assert done.returncode == 0 and said in done.stdout, done.stderr
+    assert run.stat().st_mtime_ns == stamp
+    rows = [line.split(",") for line in (run / "metrics.csv").read_text().splitlines()]
+    assert [line[0] for line in rows[1:]] == ["2", "4", "6", "8", "10"]
