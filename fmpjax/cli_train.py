@@ -49,7 +49,7 @@ class Train:
     """Train a policy from a demonstration."""
 
     method: Annotated[str | None, _setting("method")] = None
-    """Motion prior; `fmpjax list` shows all of them."""
+    """Motion prior; `fmpjax list` shows all of them. `add` and `tracking` bring the command `phase` with them."""
     reset: Annotated[str | None, _setting("env.reset")] = None
     """`dataset` (a demonstration state) or `fixed` (the default pose)."""
     preset: Annotated[str | None, default("laptop on a CPU, paper on an accelerator")] = None

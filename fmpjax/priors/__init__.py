@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-from fmpjax.config import Config
+from fmpjax.config import FOLLOWERS, Config
 from fmpjax.errors import UserError
-from fmpjax.priors import amp, barycentric, empirical, flow, gail, pwil, smp, wail
+from fmpjax.priors import add, amp, barycentric, empirical, flow, gail, pwil, smp, tracking, wail
 from fmpjax.priors.base import Expert, MotionPrior, Reward, Rollout, couple, median_reward
 
 _REGISTRY: dict[str, Callable[[Expert, Config], MotionPrior]] = {
@@ -18,6 +18,8 @@ _REGISTRY: dict[str, Callable[[Expert, Config], MotionPrior]] = {
     "wail": wail.make,
     "pwil": pwil.make,
     "smp": smp.make,
+    "add": add.make,
+    "tracking": tracking.make,
 }
 METHODS = tuple(_REGISTRY)
 PAPER = ("fmp", "endpoint", "value", "bank16", "barycentric", "amp")  # those of the paper's Table I
@@ -62,6 +64,11 @@ def remembers(method: str) -> bool:
     return method in _REMEMBERS
 
 
+def follows(method: str) -> bool:
+    """Whether the prior called ``method`` compares each step with the demonstration at the same time."""
+    return method in FOLLOWERS
+
+
 def check_potential(method: str) -> None:
     """Raise a `UserError` unless ``method`` fits a potential to transport."""
     if method not in _POTENTIALS:
@@ -85,6 +92,7 @@ __all__ = [
     "check_potential",
     "couple",
     "descriptions",
+    "follows",
     "make",
     "median_reward",
     "normalizes",
