@@ -98,7 +98,7 @@ class SMPConfig(Section):
 
     network: Literal["published", "small"] = "published"  # [S]; "small" has a thirtieth of the arithmetic [D]
     noise_steps: PositiveInt = 50  # DDPM steps, squared-cosine schedule [S]
-    iterations: PositiveInt = 50_000  # of pretraining, all in the first update of a run [S]
+    iterations: PositiveInt = 50_000  # of pretraining, before the policy learns [S]
     batch: PositiveInt = 512  # windows per iteration [S]
     learning_rate: PositiveFloat = 1e-4  # of AdamW [S]
     weight_decay: NonNegativeFloat = 0.01  # of AdamW [D: its usual one]

@@ -56,6 +56,21 @@ class Expert(NamedTuple):
         return self.windows[jax.random.choice(key, len(self.windows), shape, p=self.share)]
 
 
+class Pretraining(NamedTuple):
+    """What a prior learns of the demonstration before any policy: the same for all runs, so it is kept for the next.
+
+    A state that is not pretrained is pretrained in its first update.
+    """
+
+    iterations: int
+    settings: Mapping[str, Any]  # all that it depends on beside the demonstration, by name
+    # State, key, iteration until which to learn -> state, {"loss": mean per iteration, "skipped": updates left out}
+    advance: Callable[[PriorState, jax.Array, jax.Array | int], tuple[PriorState, Metrics]]
+    finished: Callable[[PriorState], jax.Array]  # scalar bool
+    learned: Callable[[PriorState], Any]  # what is kept, a pytree of arrays
+    put: Callable[[PriorState, Any], PriorState]  # the state of a run with what was kept
+
+
 class MotionPrior(NamedTuple):
     """A learned reward.
 
@@ -66,6 +81,7 @@ class MotionPrior(NamedTuple):
     init: Callable[[jax.Array], PriorState]
     update: Callable[[PriorState, Rollout, jax.Array], tuple[PriorState, jax.Array, Metrics]]
     score: Callable[[PriorState, jax.Array], jax.Array]  # of features [n, D], higher is better, before normalization
+    pretraining: Pretraining | None = None
 
 
 def flatten(rollout: Rollout, stand_in: Float[jax.Array, " D"]) -> Float[jax.Array, "N D"]:

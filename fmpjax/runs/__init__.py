@@ -2,6 +2,7 @@
 
 from fmpjax.files import without_places, write
 from fmpjax.provenance import machine, provenance
+from fmpjax.runs import pretraining
 from fmpjax.runs.clock import End
 from fmpjax.runs.folder import Run, check_trainable, default_folder, default_preset, describe, load_motion
 from fmpjax.runs.outputs import export, finish, video, web
@@ -20,6 +21,7 @@ __all__ = [
     "finish",
     "load_motion",
     "machine",
+    "pretraining",
     "provenance",
     "train",
     "video",
