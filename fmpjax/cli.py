@@ -237,8 +237,8 @@ COMMANDS = shell.Group(
     "Flow-Matched Motion Priors in JAX. `fmpjax --version` prints the version.",
     {
         "train": Train, "pretrain": Pretrain, "evaluate": Evaluate, "diagnose": Diagnose, "render": Render,
-        "export": Export, "sim2sim": Sim2Sim, "play": Play, "experiment": EXPERIMENT, "report": Report, "motion": MOTION,
-        "config": ShowConfig, "settings": Settings,
+        "export": Export, "sim2sim": Sim2Sim, "play": Play, "experiment": EXPERIMENT, "report": Report,
+        "motion": MOTION, "config": ShowConfig, "settings": Settings,
         "list": List,
     },
 )  # fmt: skip
