@@ -40,12 +40,13 @@ def main() -> None:
     _, record = rollout(state, key)
     seen = priors.Rollout(windows(state, record), ~record.nonfinite, record.length == 1)
     pool = seen.features.reshape(-1, seen.features.shape[-1])
+    methods = [method for method in priors.METHODS if not priors.follows(method)]  # without a command
     calls = {
         "rollout": lambda: rollout(state, key),
         "features": lambda: windows(state, record),
         "PPO": lambda: improve(state, record, seen.valid.astype(np.float32), key),
     }
-    for method in priors.METHODS:
+    for method in methods:
         prior = priors.make(method, trainer.expert, settings)
         update, score = jax.jit(prior.update), jax.jit(prior.score)
         fitted = update(prior.init(key), seen, key)[0]
@@ -60,7 +61,7 @@ def main() -> None:
     print(f"features {ms['features']:.0f} ms, PPO {ms['PPO']:.0f} ms")
     print(f"{'method':<14}{'fit, ms':>10}{'score, ms':>11}{'of the iteration':>18}{'overhead':>10}")
     rows = []
-    for method in priors.METHODS:
+    for method in methods:
         update, score = ms[f"{method} update"], ms[f"{method} score"]
         row = (method, max(0.0, update - score), score, update / (rest + update), update / rest)
         rows.append(row)

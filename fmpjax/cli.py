@@ -14,7 +14,7 @@ from fmpjax import experiments, machine, shell, tables
 from fmpjax.cli_deploy import Sim2Sim
 from fmpjax.cli_motion import MOTION
 from fmpjax.cli_play import Play
-from fmpjax.cli_train import Train, runs_module
+from fmpjax.cli_train import Pretrain, Train, runs_module
 from fmpjax.errors import UserError
 from fmpjax.shell import default
 
@@ -249,9 +249,9 @@ EXPERIMENT = shell.Group("Run a study of priors or runs, one per table or figure
 COMMANDS = shell.Group(
     "Flow-Matched Motion Priors in JAX. `fmpjax --version` prints the version.",
     {
-        "train": Train, "evaluate": Evaluate, "diagnose": Diagnose, "render": Render, "export": Export,
-        "sim2sim": Sim2Sim, "play": Play, "experiment": EXPERIMENT, "report": Report, "motion": MOTION,
-        "config": ShowConfig, "settings": Settings,
+        "train": Train, "pretrain": Pretrain, "evaluate": Evaluate, "diagnose": Diagnose, "render": Render,
+        "export": Export, "sim2sim": Sim2Sim, "play": Play, "experiment": EXPERIMENT, "report": Report,
+        "motion": MOTION, "config": ShowConfig, "settings": Settings,
         "list": List,
     },
 )  # fmt: skip

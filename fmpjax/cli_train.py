@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -44,12 +45,68 @@ def _setting(key: str) -> object:
     return default(", ".join(f"{value} in {explaining.enumerated(names)}" for value, names in presets.items()))
 
 
+def _set(items: Sequence[str]) -> dict[str, str]:
+    """The settings that ``--set`` names."""
+    changes = {}
+    for item in items:
+        key, equals, value = item.partition("=")
+        if not equals or key == "preset":
+            raise UserError(f"--set {item!r}: expected section.field=value")
+        changes[key] = value
+    return changes
+
+
+@dataclasses.dataclass(frozen=True)
+class Pretrain:
+    """Train what a method learns of the demonstration before any policy, and keep it for all runs."""
+
+    method: tyro.conf.Positional[str]
+    """`smp`, whose diffusion model is trained first."""
+    preset: Annotated[str | None, default("laptop on a CPU, paper on an accelerator")] = None
+    """`smoke`, `laptop`, `robust`, `robot` or `paper`."""
+    robot: Annotated[str | None, _setting("robot")] = None
+    """A robot under robots/."""
+    motion: Annotated[str | None, _setting("motion")] = None
+    """Motions as `fmpjax train` takes them."""
+    frames: Annotated[str | None, default("all")] = None
+    """Source rows first:last of the motion, 0-based, both included; of several motions with commas between them."""
+    command: Annotated[str | None, default("none")] = None
+    """The command of the runs, with which heading axes go."""
+    again: bool = False
+    """Train also where the cache has it."""
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Any other setting as section.field=value; `smp.network=published` is the published network."""
+
+    def __call__(self) -> None:
+        from fmpjax import priors
+
+        priors.check_pretrained(self.method)
+        runs = runs_module()
+        from fmpjax.logs import Progress
+        from fmpjax.motion import library
+        from fmpjax.trainer import Trainer
+
+        named = {"robot": self.robot, "motion": self.motion, "frames": self.frames}
+        changes = {key: value for key, value in named.items() if value is not None} | _set(self.set)
+        changes = configuration.commanded(self.command, {**changes, "method": self.method})
+        config = configuration.preset(self.preset or runs.default_preset(), **changes)
+        config = configuration.with_changes(config, {"motion": library.listed(config.motion)})
+        runs.check_trainable(config)
+        trainer = Trainer(config, runs.load_motion(config))
+        folder = runs.pretraining.folder_of(trainer)
+        if folder is None:
+            raise UserError("there is no cache folder to keep it in: expected a home, or XDG_CACHE_HOME")
+        runs.pretraining.pretrain(trainer, folder, Progress(), again=self.again)
+        for name in ("metrics.csv", "curves.png", "settings.json"):
+            print(f"in the cache: {folder / name}")
+
+
 @dataclasses.dataclass(frozen=True)
 class Train:
     """Train a policy from a demonstration."""
 
     method: Annotated[str | None, _setting("method")] = None
-    """Motion prior; `fmpjax list` shows all of them."""
+    """Motion prior; `fmpjax list` shows all of them. `add` and `tracking` bring the command `phase` with them."""
     reset: Annotated[str | None, _setting("env.reset")] = None
     """`dataset` (a demonstration state) or `fixed` (the default pose)."""
     preset: Annotated[str | None, default("laptop on a CPU, paper on an accelerator")] = None
@@ -222,11 +279,7 @@ class Train:
             "transitions": self.transitions,
         }
         changes: dict[str, object] = {key: value for key, value in named.items() if value is not None}
-        for item in self.set:
-            key, equals, value = item.partition("=")
-            if not equals or key == "preset":
-                raise UserError(f"--set {item!r}: expected section.field=value")
-            changes[key] = value
+        changes |= _set(self.set)
         if self.resume:
             return changes | ({} if self.command is None else {"command.kind": self.command})
         return configuration.commanded(self.command, changes)

@@ -96,6 +96,7 @@ class Steps(NamedTuple):
     frame: jax.Array  # [T, N, F] compact frame after the step, before any reset
     window: jax.Array  # [T, N, H] int32 indices into the frame table
     obeyed: Any = ()  # [T, N] in [0, 1], what obeying the command earned; nothing without commands
+    wanted: Any = ()  # [T, N] int32 indices into the frame table, where the command names the frame to reach
 
 
 class Env:
@@ -318,8 +319,9 @@ class Env:
         reached = self.advance(now.physics, action, now.disturbed, drawn.disturbed)
         age = now.age + 1
         timed_out = (age >= cap) & ~reached.fell
-        command, obeyed = (), ()
+        command, obeyed, wanted = (), (), ()
         if self.command:
+            wanted = self.command.wanted(now.command) if self.command.wanted else ()
             command, over, obeyed = self.command.advance(now.command, drawn.command, reached.observed.frame)
             timed_out |= over & ~reached.fell
         window = sharding.split(jnp.concatenate([now.window[:, 1:], drawn.row[:, None]], axis=1))
@@ -338,6 +340,7 @@ class Env:
             frame=reached.observed.frame,
             window=window,
             obeyed=obeyed,
+            wanted=wanted,
         )
         done = reached.fell | timed_out
         sim, observed = self._begin(drawn.start, drawn.key)

@@ -332,6 +332,10 @@ class FeatureMap(NamedTuple):
         x = jnp.clip(z, -self.clip, self.clip) * self.weight
         return x.reshape(*x.shape[:-2], -1)
 
+    def placed(self, frames: Float[jax.Array, "*batch F"]) -> Float[jax.Array, "*batch F"]:
+        """Single frames ``[..., F]`` as the newest of a window: x and y are 0, and vectors are in the map's axes."""
+        return _placed(frames[..., None, :], self.planar)[..., 0, :]
+
     def unclipped(self) -> "FeatureMap":
         """The same map without the clip, for a prior that normalizes and clips windows itself."""
         return self._replace(clip=jnp.float32(jnp.inf))

@@ -48,9 +48,13 @@ class MetricsLog:
         """Training time behind the last row, s."""
         return float(self.rows[-1]["seconds"]) if self.rows else 0.0
 
-    def write(self, iteration: int, transitions: int, seconds: float, values: Mapping[str, float]) -> None:
-        """One row; what is missing or not a number stays empty."""
-        row: dict[str, Any] = {"iteration": iteration, "transitions": transitions, "seconds": f"{seconds:.2f}"}
+    def write(self, iteration: int, transitions: int | None, seconds: float, values: Mapping[str, float]) -> None:
+        """One row; what is missing or not a number stays empty.
+
+        Without transitions, where no environment steps, TensorBoard's steps are iterations.
+        """
+        row: dict[str, Any] = {"iteration": iteration, "seconds": f"{seconds:.2f}"}
+        row |= {} if transitions is None else {"transitions": transitions}
         row |= {k: f"{v:.6g}" for k, v in values.items() if not math.isnan(v)}
         self.rows.append(row)
         if not self._keep:
@@ -59,7 +63,7 @@ class MetricsLog:
             csv.DictWriter(file, self._columns, extrasaction="ignore", restval="").writerow(row)
         for name, value in values.items():
             if not math.isnan(value):
-                self._board.add_scalar(name, value, transitions)
+                self._board.add_scalar(name, value, iteration if transitions is None else transitions)
         self._board.flush()
 
     def close(self) -> None:

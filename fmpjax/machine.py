@@ -38,15 +38,6 @@ def memory() -> int | None:
     return min((size for size in found if size > 0), default=None)
 
 
-def cache_folder(name: str) -> Path:
-    """A folder of the package in the user's cache folder, which may not exist yet.
-
-    Raises:
-      RuntimeError: there is no home folder.
-    """
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fmpjax" / name
-
-
 def keep_compiled() -> None:
     """Have JAX keep compiled programs in the user's cache folder, 1 GiB at most, so that a second run starts at once.
 
@@ -57,15 +48,24 @@ def keep_compiled() -> None:
 
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
-    try:
-        folder = cache_folder("compiled") / hashlib.sha256(_processor().encode()).hexdigest()[:12]
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # without a home, or with one that cannot be written, nothing is kept
+    folder = cache_folder("compiled", hashlib.sha256(_processor().encode()).hexdigest()[:12])
+    if folder is None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_compilation_cache_max_size", 2**30)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def cache_folder(*names: str) -> Path | None:
+    """A folder, made where it is not there, below the user's cache; None without a home, or one that can be written."""
+    try:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = base.joinpath("fmpjax", *names)
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):
+        return None
+    return folder
 
 
 def _processor() -> str:

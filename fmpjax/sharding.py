@@ -72,6 +72,11 @@ def agree(flag: bool) -> bool:
     return bool(multihost_utils.broadcast_one_to_all(np.array(flag))) if jax.process_count() > 1 else flag
 
 
+def first(tree: Any) -> Any:
+    """The first process's arrays, on every process, whose own have the same shapes."""
+    return multihost_utils.broadcast_one_to_all(tree) if jax.process_count() > 1 else tree
+
+
 def wait(what: str) -> None:
     """Until every process is here."""
     if jax.process_count() > 1:

@@ -56,6 +56,7 @@ class Trainer:
             weight=jnp.tile(self.feature_map.weight, self.env.horizon),
             horizon=self.env.horizon,
             share=None if share is None else jnp.asarray(share, jnp.float32),
+            layout=FrameLayout.of(self.robot),
         )
         # What windows are compared in is the same for every method; what its prior is given need not be.
         self.prior_map = self.feature_map.unclipped() if priors.normalizes(config.method) else self.feature_map
@@ -105,11 +106,7 @@ class Trainer:
     def _iteration(self, state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, prior_key, ppo_key = jax.random.split(state.key, 4)
         env, steps = self.env.rollout(state.env, self.ppo.act(state.ppo), rollout_key, self.config.ppo.rollout_steps)
-        # Devices split the windows as the prior does, by rows of the rollout: indices travel, windows do not.
-        windows = self.prior_map(self.env.frame_table(state.env, steps)[sharding.gather(steps.window)])
-        prior, reward, prior_metrics = self.prior.update(
-            state.prior, priors.Rollout(windows, ~steps.nonfinite, steps.length == 1), prior_key
-        )
+        prior, reward, prior_metrics = self.prior.update(state.prior, self._rollout(state, steps), prior_key)
         reward, command_metrics = self._commanded(steps, reward)
         ppo, ppo_metrics = self.ppo.update(state.ppo, policy_batch(steps, reward), ppo_key)
         skipped = prior_metrics.get("skipped", 0.0) + ppo_metrics["skipped"]
@@ -125,6 +122,17 @@ class Trainer:
         )
         figures = {name: jnp.asarray(value, jnp.float32) for name, value in figures.items()}
         return TrainState(ppo, prior, env, key, state.iteration + 1, nonfinite), figures
+
+    def _rollout(self, state: TrainState, steps: Steps) -> priors.Rollout:
+        """What the prior sees of the steps: true states, whatever the policy's sensors say."""
+        table = self.env.frame_table(state.env, steps)
+        # Devices split the windows as the prior does, by rows of the rollout: indices travel, windows do not.
+        windows = self.prior_map(table[sharding.gather(steps.window)])
+        rollout = priors.Rollout(windows, ~steps.nonfinite, steps.length == 1)
+        if not priors.follows(self.config.method):
+            return rollout
+        reached, wanted = self.feature_map.placed(steps.frame), self.feature_map.placed(table[steps.wanted])
+        return rollout._replace(frame=reached, wanted=wanted)
 
     def _commanded(self, steps: Steps, reward: jax.Array) -> tuple[jax.Array, Metrics]:
         """The prior's reward ``[T, N]`` joined by what the steps earn by obeying, where they are told anything."""

@@ -6,7 +6,17 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax.config import AMPConfig, Config, EnvConfig, GAILConfig, PriorConfig, SMPConfig, WAILConfig, preset
+from fmpjax.config import (
+    ADDConfig,
+    AMPConfig,
+    Config,
+    EnvConfig,
+    GAILConfig,
+    PriorConfig,
+    SMPConfig,
+    WAILConfig,
+    preset,
+)
 from fmpjax.priors import Expert, Rollout
 
 ROOT = Path(__file__).resolve().parents[1]  # of the checkout
@@ -35,6 +45,7 @@ SMALL = Config(
     gail=GAILConfig(hidden=(16,), updates=4, minibatch=32),
     wail=WAILConfig(hidden=(16,), updates=2, minibatch=32),
     smp=SMPConfig(network="small", iterations=5, batch=8),
+    add=ADDConfig(hidden=(16,), updates=4, minibatch=32, replay=400, replay_new=10, optimizer="adam"),
     env=EnvConfig(count=COUNT),
 )
 

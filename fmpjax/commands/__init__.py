@@ -38,4 +38,6 @@ def make(config: Config, robot: Robot, library: MotionLibrary, frames: jax.Array
 
 def combine(config: CommandConfig, prior: jax.Array, command: jax.Array) -> jax.Array:
     """The reward of steps whose motion earns ``prior`` and whose obedience earns ``command``, of the same shape."""
+    if config.combine == "prior":
+        return prior
     return prior * command if config.combine == "product" else prior + config.weight * command

@@ -21,6 +21,8 @@ class Command(NamedTuple):
     observe: Callable[[Any], jax.Array]  # state -> [N, size]
     # state -> [N, R], what else the reward depends on; a deployable actor does not see it. None for nothing
     reveal: Callable[[Any], jax.Array] | None = None
+    # state -> rows [N] of the table whose frames the next step should reach; None where the command names none
+    wanted: Callable[[Any], jax.Array] | None = None
 
 
 class Told(NamedTuple):

@@ -39,9 +39,11 @@ def make(robot: Robot, library: MotionLibrary, frames: jax.Array, stride: int) -
     def begin(rows, drawn):
         return jnp.where(rows > last, 0, rows)
 
+    def following(row):
+        return jnp.minimum(row + stride, last)
+
     def advance(row, drawn, frame):
-        following = row + stride
-        return Told(jnp.minimum(following, last), following >= last, reward(row, frame))
+        return Told(following(row), row + stride >= last, reward(row, frame))
 
     def observe(row):
         share = row / last
@@ -49,7 +51,7 @@ def make(robot: Robot, library: MotionLibrary, frames: jax.Array, stride: int) -
         return jnp.concatenate([share[..., None], jnp.sin(angles), jnp.cos(angles)], axis=-1)
 
     def reward(row, frame):
-        wanted = table[jnp.minimum(row + stride, last)]
+        wanted = table[following(row)]
         # 2 - 2 cos of the angle between is its square, for the errors that matter.
         product = frame * wanted
         cosine = product[..., layout.cosine] + product[..., layout.sine]
@@ -62,7 +64,7 @@ def make(robot: Robot, library: MotionLibrary, frames: jax.Array, stride: int) -
         )
         return sum(share * jnp.exp(-sharpness * error) for (share, sharpness), error in errors)
 
-    return Command(1 + 2 * len(HARMONICS), lambda key, shape: (), begin, advance, observe)
+    return Command(1 + 2 * len(HARMONICS), lambda key, shape: (), begin, advance, observe, wanted=following)
 
 
 def _heights(rotation: jax.Array) -> jax.Array:

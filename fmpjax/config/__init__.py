@@ -7,28 +7,35 @@ part of a formula (in `env`, `ppo`, `features`, `transport`, `potential` and `pr
 from fmpjax.config.disturbance import DisturbanceConfig
 from fmpjax.config.presets import COMMANDS, DESCRIPTIONS, PRESETS, commanded, preset
 from fmpjax.config.reading import flatten, from_json, read, to_json, validate, with_changes
-from fmpjax.config.sections import (
+from fmpjax.config.rewards import (
+    FOLLOWERS,
     SMP_NETWORKS,
+    ADDConfig,
     AdversaryConfig,
     AMPConfig,
+    GAILConfig,
+    PWILConfig,
+    SMPConfig,
+    TrackingConfig,
+    WAILConfig,
+)
+from fmpjax.config.sections import (
     CommandConfig,
     Config,
     EnvConfig,
     FeatureConfig,
-    GAILConfig,
     PhysicsConfig,
     PPOConfig,
     PriorConfig,
-    PWILConfig,
-    SMPConfig,
-    WAILConfig,
 )
 
 __all__ = [
     "COMMANDS",
     "DESCRIPTIONS",
+    "FOLLOWERS",
     "PRESETS",
     "SMP_NETWORKS",
+    "ADDConfig",
     "AMPConfig",
     "AdversaryConfig",
     "CommandConfig",
@@ -42,6 +49,7 @@ __all__ = [
     "PhysicsConfig",
     "PriorConfig",
     "SMPConfig",
+    "TrackingConfig",
     "WAILConfig",
     "commanded",
     "flatten",

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fmpjax.config.reading import validate, with_changes
+from fmpjax.config.rewards import FOLLOWERS
 from fmpjax.config.sections import Config
 from fmpjax.errors import UserError
 
@@ -57,6 +58,12 @@ _LAPTOP: dict[str, Any] = {
     "smp.batch": 128,
     "smp.learning_rate": 1e-3,
     "smp.scale": 400.0,  # about e^6: an average window earns 1, which the critic finds, and not 0.0025
+    "add.hidden": (256, 128),  # AMP's
+    "add.updates": 3,  # AMP's
+    "add.minibatch": 256,  # AMP's
+    "add.replay": 40_000,  # AMP's
+    "add.optimizer": "adam",  # AMP's
+    "add.learning_rate": 1e-4,  # AMP's
     "ppo.hidden": (256, 128),  # fewer to multiply
     # Sample efficiency: a smooth activation, and exploration that is learned.
     "ppo.activation": "elu",
@@ -105,6 +112,10 @@ _SMOKE: dict[str, Any] = _LAPTOP | {
     "wail.minibatch": 64,
     "smp.iterations": 20,
     "smp.batch": 32,
+    "add.hidden": (64, 64),
+    "add.updates": 2,
+    "add.minibatch": 64,
+    "add.replay": 1000,
     "ppo.hidden": (64, 64),
 }
 
@@ -140,7 +151,7 @@ _ROBUST: dict[str, Any] = _LAPTOP | {
 
 # What goes with a command unless it is set otherwise: neither the policy nor the prior knows which way is north.
 COMMANDS: Mapping[str, Mapping[str, Any]] = {
-    "none": {},
+    "none": {"command.kind": "none"},
     "velocity": {
         "command.kind": "velocity",
         "motion": "gaits",
@@ -150,6 +161,10 @@ COMMANDS: Mapping[str, Mapping[str, Any]] = {
     "phase": {"command.kind": "phase", "env.axes": "heading", "features.axes": "heading"},
     "motion": {"command.kind": "motion", "env.axes": "heading", "features.axes": "heading"},
 }
+
+# What goes with a method that compares each step with the demonstration at the same time, unless it is set otherwise.
+# Such a reward says itself how well the policy obeys.
+_FOLLOWING = COMMANDS["phase"] | {"command.combine": "prior"}
 
 
 def commanded(kind: str | None, changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -188,9 +203,12 @@ DESCRIPTIONS = {
 def preset(name: str, /, **changes: Any) -> Config:
     """A preset's configuration with changes, given as ``section.field`` keys.
 
+    A method that compares each step with the demonstration at the same time brings the command `phase` with it.
+
     Raises:
       UserError: unknown preset or field, or a value that the field cannot have.
     """
     if name not in PRESETS:
         raise UserError(f"unknown preset {name!r}: expected one of {', '.join(PRESETS)}")
-    return validate(with_changes(Config(preset=name), {**PRESETS[name], **changes}))
+    implied = _FOLLOWING if changes.get("method") in FOLLOWERS else {}
+    return validate(with_changes(Config(preset=name), {**PRESETS[name], **implied, **changes}))

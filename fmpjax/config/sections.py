@@ -22,6 +22,16 @@ from fmpjax.config.base import (
     Widths,
 )
 from fmpjax.config.disturbance import DisturbanceConfig
+from fmpjax.config.rewards import (
+    FOLLOWERS,
+    ADDConfig,
+    AMPConfig,
+    GAILConfig,
+    PWILConfig,
+    SMPConfig,
+    TrackingConfig,
+    WAILConfig,
+)
 from fmpjax.errors import UserError
 
 
@@ -85,7 +95,8 @@ class CommandConfig(Section):
 
     # nothing [P], a velocity in the heading frame, the time in the clip ("phase"), or one of several motions [D]
     kind: Literal["none", "velocity", "phase", "motion"] = "none"
-    combine: Literal["product", "sum"] = "product"  # of the reward of the motion and that of the command [D]
+    # of the reward of the motion and that of the command; "prior" pays the motion's alone [D]
+    combine: Literal["product", "sum", "prior"] = "product"
     weight: PositiveFloat = 1.0  # of the command's reward in a sum [D]
     hold: tuple[float, ...] = (1.0, 3.0)  # s, shortest and longest time for which a velocity or a motion is held [D]
     zero: Annotated[float, Meta(ge=0, le=1)] = 0.1  # share of the new velocities that are zero [D]
@@ -165,105 +176,6 @@ class PriorConfig(Section):
 
 
 @dataclasses.dataclass(frozen=True)
-class AdversaryConfig(Section):
-    """What the adversarial priors share, with AMP's numbers."""
-
-    hidden: Widths = (1024, 512)  # units of the ReLU layers [M]
-    logit_init: NonNegativeFloat = 1.0  # the logit layer's weights are uniform in this range [M]
-    updates: PositiveInt = 32  # per rollout: two passes in minibatches of two windows per environment [M]
-    minibatch: PositiveInt = 2048  # windows of the demonstration, as many current and as many replayed ones [M]
-    replay: PositiveInt = 200_000  # windows kept of earlier rollouts [M]
-    replay_new: PositiveInt = 1000  # windows per rollout that go in once it is full [M]
-    gradient_penalty: NonNegativeFloat = 10.0  # weight of half the squared slopes on both sides [M]
-    logit_penalty: NonNegativeFloat = 0.01  # weight of the logit layer's squared weights [M]
-    optimizer: Optimizer = "sgd"  # of the network [M]
-    learning_rate: PositiveFloat = 2.5e-4  # of the optimizer [M]
-    momentum: Decay = 0.9  # momentum of SGD, which Adam leaves unread [M]
-    weight_decay: NonNegativeFloat = 1e-4  # of the optimizer [M]
-    normalizer_clip: PositiveFloat = 10.0  # normalized coordinates are clipped to this magnitude [M]
-    normalizer_floor: PositiveFloat = 1e-4  # least standard deviation of a coordinate [M]
-
-
-@dataclasses.dataclass(frozen=True)
-class AMPConfig(AdversaryConfig):
-    """The discriminator of ``method=amp``."""
-
-    least_probability: Fraction = 1e-4  # caps the reward at -2 log of it [M]
-
-
-@dataclasses.dataclass(frozen=True)
-class GAILConfig(AdversaryConfig):
-    """The discriminator of ``method=gail``: AMP's network."""
-
-    replay: NonNegativeInt = 0  # windows kept of earlier rollouts; none: the opponent is the current policy [D]
-    gradient_penalty: NonNegativeFloat = 0.0  # weight of half the squared slopes, AMP's form [D]; 0 or 10 [A]
-    logit_penalty: NonNegativeFloat = 0.0  # weight of the logit layer's squared weights [A: none]
-    optimizer: Optimizer = "adam"  # of the network [A]
-    learning_rate: PositiveFloat = 1e-5  # of the optimizer [A]
-    weight_decay: NonNegativeFloat = 0.0  # of the optimizer [A: none]
-
-
-@dataclasses.dataclass(frozen=True)
-class WAILConfig(AdversaryConfig):
-    """The critic of ``method=wail``: AMP's network."""
-
-    updates: PositiveInt = 5  # per rollout, two to five [W]
-    replay: NonNegativeInt = 0  # windows kept of earlier rollouts; none: the distance is to the current policy [D]
-    gradient_penalty: NonNegativeFloat = 10.0  # weight of (slope - 1)^2 at random interpolates [W]
-    logit_penalty: NonNegativeFloat = 0.0  # weight of the logit layer's squared weights; the slope is bounded [W]
-    optimizer: Optimizer = "adam"  # of the network [W]
-    learning_rate: PositiveFloat = 1e-4  # of the optimizer [D: WGAN-GP's]
-    weight_decay: NonNegativeFloat = 0.0  # of the optimizer [D: none]
-    deviation_half_life: PositiveFloat = 16.0  # rollouts, of the running deviation that the reward divides by [D]
-    deviation_floor: PositiveFloat = 1e-3  # least such deviation [D]
-
-
-@dataclasses.dataclass(frozen=True)
-class PWILConfig(Section):
-    """The greedy coupling of ``method=pwil``."""
-
-    scale: PositiveFloat = 5.0  # alpha, the reward of a perfect step [L]
-    decay: PositiveFloat = 5.0  # beta, of the reward with the distance [L]
-    slack: NonNegativeFloat = 1e-6  # by how much the mass of a step is below 1 / T; the demonstration lasts [L]
-
-
-# Transformer layers, heads, numbers per head.
-SMP_NETWORKS = {
-    "published": (2, 4, 64),  # [S]
-    "small": (1, 2, 32),  # a thirtieth of the arithmetic, for a CPU [D]
-}
-
-
-@dataclasses.dataclass(frozen=True)
-class SMPConfig(Section):
-    """The diffusion model of ``method=smp``."""
-
-    network: Literal["published", "small"] = "published"  # [S]; "small" has a thirtieth of the arithmetic [D]
-    noise_steps: PositiveInt = 50  # DDPM steps, squared-cosine schedule [S]
-    iterations: PositiveInt = 50_000  # of pretraining, all in the first update of a run [S]
-    batch: PositiveInt = 512  # windows per iteration [S]
-    learning_rate: PositiveFloat = 1e-4  # of AdamW [S]
-    weight_decay: NonNegativeFloat = 0.01  # of AdamW [D: its usual one]
-    clip_norm: PositiveFloat = 1.0  # gradient-norm clip [S]
-    average: Decay = 0.995  # factor of the parameter average; the average scores [S, there once in ten iterations]
-    # noise steps at which windows are scored [S]
-    score_steps: Annotated[tuple[NonNegativeInt, ...], Meta(min_length=1)] = (22, 15, 8)
-    score_batch: PositiveInt = 4096  # windows scored side by side, which bounds the memory that this takes [S]
-    scale: PositiveFloat = 1.0  # the reward of a window without error [S]
-    decay: PositiveFloat = 6.0  # of the reward with the error relative to its running mean [S]
-    error_floor: PositiveFloat = 1e-4  # least running mean of the error [S]
-    mean_samples: PositiveFloat = 5e7  # windows after which that running mean stays [S, its G1 variant]
-
-    def check(self) -> None:
-        """Raise a `UserError` where windows would be scored at a noise step that is none."""
-        if max(self.score_steps) >= self.noise_steps:
-            raise UserError(
-                f"setting smp.score_steps is {', '.join(map(str, self.score_steps))}: expected noise steps from 0 to "
-                f"{self.noise_steps - 1}, below smp.noise_steps"
-            )
-
-
-@dataclasses.dataclass(frozen=True)
 class PPOConfig(Section):
     """Policy optimization, section IV-A of the paper."""
 
@@ -338,6 +250,8 @@ class Config(Section):
     wail: WAILConfig = WAILConfig()
     pwil: PWILConfig = PWILConfig()
     smp: SMPConfig = SMPConfig()
+    add: ADDConfig = ADDConfig()
+    tracking: TrackingConfig = TrackingConfig()
     ppo: PPOConfig = PPOConfig()
 
     @property
@@ -365,6 +279,11 @@ class Config(Section):
         noise = [f"{size:g}" for size in self.evaluation_noise]
         if len(set(noise)) < len(noise):
             raise UserError(f"setting evaluation_noise is {', '.join(noise)}: expected each size once")
+        if self.method in FOLLOWERS and self.command.kind != "phase":
+            raise UserError(
+                f"method is {self.method!r} and command.kind {self.command.kind!r}: expected 'phase', since "
+                f"{self.method} compares each step with the demonstration at the commanded time"
+            )
         longest = self.env.longest_episode
         if self.method == "pwil" and self.pwil.slack * longest >= 1:
             raise UserError(

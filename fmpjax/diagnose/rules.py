@@ -12,7 +12,16 @@ from fmpjax.diagnose.measures import DISTINCT, STEADIEST, STEPS, TRAVELS
 _POTENTIALS = ("fmp", "endpoint", "value")
 _CENTERED = (*_POTENTIALS, "bank16")  # the reward is divided by the score's spread
 _TRANSPORTS = (*_CENTERED, "barycentric")
-_SECTIONS = ("prior", "amp", "gail", "wail", "pwil", "smp")  # settings of a reward; transports share "prior"
+_SECTIONS = (
+    "prior",
+    "amp",
+    "gail",
+    "wail",
+    "pwil",
+    "smp",
+    "add",
+    "tracking",
+)  # settings of a reward; transports share "prior"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -264,11 +273,11 @@ RULES = (
         Range(low=0.1),
         (
             *("prior.endpoint_weight", "prior.flow_weight", "amp.gradient_penalty", "gail.gradient_penalty"),
-            *("wail.updates", "smp.iterations", "method"),
+            *("wail.updates", "smp.iterations", "add.gradient_penalty", "method"),
         ),
         "`table1/value-fixed-seed0` −40, `table1/fixed_pose/value-fixed-seed1` −26; the bundled walks, the least of "
         "those that walk, 0.34 to 0.54",
-        methods=(*_CENTERED, "amp", "gail", "wail", "smp"),
+        methods=(*_CENTERED, "amp", "gail", "wail", "smp", "add"),
     ),
     Rule(
         "discriminator saturated",
@@ -280,10 +289,11 @@ RULES = (
         (
             *("amp.gradient_penalty", "amp.learning_rate", "amp.updates"),
             *("gail.gradient_penalty", "gail.learning_rate", "gail.updates"),
+            *("add.gradient_penalty", "add.learning_rate", "add.updates"),
         ),
         "AMP is at 0.24 to 0.41 at the ends, no row under 0.11; an accuracy of 1 alone is no fault: "
-        "`table1/amp-fixed-seed0` walks with it; no course is of GAIL",
-        methods=("amp", "gail"),
+        "`table1/amp-fixed-seed0` walks with it; no course is of GAIL or ADD",
+        methods=("amp", "gail", "add"),
     ),
     Rule(
         "fit unconverged",
@@ -331,9 +341,9 @@ RULES = (
         "`fit/skipped`, per rollout",
         lambda course: course["fit/skipped"],
         Range(high=0.0),
-        tuple(f"{section}.learning_rate" for section in ("prior", "amp", "gail", "wail", "smp")),
+        tuple(f"{section}.learning_rate" for section in ("prior", "amp", "gail", "wail", "smp", "add")),
         "0 in every row of every course",
-        methods=(*_POTENTIALS, "amp", "gail", "wail", "smp"),
+        methods=(*_POTENTIALS, "amp", "gail", "wail", "smp", "add"),
     ),
     Rule(
         "policy updates skipped",

@@ -315,10 +315,10 @@ def _explained(address: str):
 
 
 def _cache() -> Path:
-    try:
-        return machine.cache_folder("motions")
-    except RuntimeError:
-        raise UserError("there is no home folder for a cache: expected one, or XDG_CACHE_HOME") from None
+    folder = machine.cache_folder("motions")
+    if folder is None:
+        raise UserError("no cache folder can be written: expected a home folder, or one in XDG_CACHE_HOME")
+    return folder
 
 
 @contextlib.contextmanager

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
-from fmpjax.config import Config
+from fmpjax.config import FOLLOWERS, Config
 from fmpjax.errors import UserError
-from fmpjax.priors import amp, barycentric, empirical, flow, gail, pwil, smp, wail
-from fmpjax.priors.base import Expert, MotionPrior, Reward, Rollout, couple, median_reward
+from fmpjax.priors import add, amp, barycentric, empirical, flow, gail, pwil, smp, tracking, wail
+from fmpjax.priors.base import Expert, MotionPrior, Pretraining, Reward, Rollout, couple, median_reward
 
 _REGISTRY: dict[str, Callable[[Expert, Config], MotionPrior]] = {
     "fmp": flow.make,
@@ -18,11 +18,14 @@ _REGISTRY: dict[str, Callable[[Expert, Config], MotionPrior]] = {
     "wail": wail.make,
     "pwil": pwil.make,
     "smp": smp.make,
+    "add": add.make,
+    "tracking": tracking.make,
 }
 METHODS = tuple(_REGISTRY)
 PAPER = ("fmp", "endpoint", "value", "bank16", "barycentric", "amp")  # those of the paper's Table I
 _OWN_NORMALIZER = ("amp", "gail", "wail")
 _REMEMBERS = ("pwil",)
+_PRETRAINED = ("smp",)
 _POTENTIALS = ("fmp", "endpoint", "value")
 
 
@@ -62,6 +65,18 @@ def remembers(method: str) -> bool:
     return method in _REMEMBERS
 
 
+def follows(method: str) -> bool:
+    """Whether the prior called ``method`` compares each step with the demonstration at the same time."""
+    return method in FOLLOWERS
+
+
+def check_pretrained(method: str) -> None:
+    """Raise a `UserError` unless ``method`` learns something of the demonstration before any policy."""
+    check(method)
+    if method not in _PRETRAINED:
+        raise UserError(f"method {method!r} learns nothing before its policy: expected {', '.join(_PRETRAINED)}")
+
+
 def check_potential(method: str) -> None:
     """Raise a `UserError` unless ``method`` fits a potential to transport."""
     if method not in _POTENTIALS:
@@ -79,12 +94,15 @@ __all__ = [
     "PAPER",
     "Expert",
     "MotionPrior",
+    "Pretraining",
     "Reward",
     "Rollout",
     "check",
     "check_potential",
+    "check_pretrained",
     "couple",
     "descriptions",
+    "follows",
     "make",
     "median_reward",
     "normalizes",

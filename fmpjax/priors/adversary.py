@@ -92,8 +92,13 @@ def store(replay: Replay, windows: jax.Array, new: int, key: jax.Array) -> Repla
     )
 
 
-def cross_entropy(apply, params, agent: jax.Array, demonstration: jax.Array, config: AdversaryConfig):
-    """Cross entropy, gradient penalty on both sides and logit penalty at normalized windows; and statistics."""
+def cross_entropy(
+    apply, params, agent: jax.Array, demonstration: jax.Array, config: AdversaryConfig, *, both: bool = True
+):
+    """Cross entropy, gradient penalty and logit penalty at normalized windows; and statistics.
+
+    The gradient penalty stands on ``both`` sides, or on the policy's alone.
+    """
 
     def logits_and_slopes(x):
         logit, pull_back = jax.vjp(lambda y: apply(params, y), x)
@@ -103,7 +108,7 @@ def cross_entropy(apply, params, agent: jax.Array, demonstration: jax.Array, con
     expert_logit, expert_slope = logits_and_slopes(demonstration)
     # -log(1 - sigmoid(l)) = softplus(l) and -log sigmoid(l) = softplus(-l).
     entropy = 0.5 * (jax.nn.softplus(agent_logit).mean() + jax.nn.softplus(-expert_logit).mean())
-    slope = 0.5 * (agent_slope + expert_slope)
+    slope = 0.5 * (agent_slope + expert_slope) if both else agent_slope
     kernel = params["params"]["logit"]["kernel"]
     total = entropy
     if config.gradient_penalty:
@@ -131,8 +136,15 @@ class Adversary(NamedTuple):
     fit: Callable[[State, jax.Array, jax.Array, jax.Array], tuple[State, Metrics]]
 
 
-def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
-    """The network that minimizes ``loss`` between the windows of the demonstration and the policy's."""
+# Normalizer, windows [n, D] of the policy and [m, D] of the demonstration -> normalizer
+Follow = Callable[[Normalizer, jax.Array, jax.Array], Normalizer]
+
+
+def make(expert: Expert, settings: AdversaryConfig, loss: Loss, follow: Follow = update_normalizer) -> Adversary:
+    """The network that minimizes ``loss`` between the windows of the demonstration and the policy's.
+
+    ``follow`` takes the normalizer from a rollout to the next.
+    """
     # long: the functions of a prior close over its settings
     net, size = network(settings.hidden, settings.logit_init, expert.dimension), expert.windows.shape[-1]
     optimizer = optax.chain(
@@ -194,7 +206,7 @@ def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
         )
         # What scored and was fitted saw one normalizer; the next rollout is scored with the next.
         seen = expert.draw(seen_key, (len(pool),))
-        normalizer = update_normalizer(state.normalizer, pool / expert.weight, seen / expert.weight)
+        normalizer = follow(state.normalizer, pool / expert.weight, seen / expert.weight)
         summary = {name: values.mean() for name, values in stats.items()} | {"skipped": stats["skipped"].sum()}
         summary |= learning.score_metrics(*learning.median_and_spread(scores), score(state, expert.windows))
         if replay is not None:
@@ -205,14 +217,18 @@ def make(expert: Expert, settings: AdversaryConfig, loss: Loss) -> Adversary:
 
 
 def discriminator(
-    expert: Expert, settings: AdversaryConfig, reward_of: Callable[[jax.Array], jax.Array]
+    expert: Expert,
+    settings: AdversaryConfig,
+    reward_of: Callable[[jax.Array], jax.Array],
+    loss: Loss | None = None,
+    follow: Follow = update_normalizer,
 ) -> MotionPrior:
-    """A prior whose adversary minimizes `cross_entropy` and whose reward is a function of the logit alone."""
-    adversary = make(
-        expert,
-        settings,
-        lambda apply, params, agent, demonstration, _: cross_entropy(apply, params, agent, demonstration, settings),
-    )
+    """A prior whose adversary minimizes ``loss`` or `cross_entropy` and whose reward depends on the logit alone."""
+
+    def entropy(apply, params, agent, demonstration, key):
+        return cross_entropy(apply, params, agent, demonstration, settings)
+
+    adversary = make(expert, settings, loss or entropy, follow)
 
     def update(state: State, rollout: Rollout, key):
         pool = flatten(rollout, expert.windows[0])

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float
 
 from fmpjax import learning, sharding, transport
 from fmpjax.config import PriorConfig
+from fmpjax.errors import UserError
+from fmpjax.frames import FrameLayout
 
 PriorState = Any
 Metrics = Mapping[str, jax.Array]
@@ -20,6 +22,9 @@ class Rollout(NamedTuple):
     features: jax.Array  # [T, N, D] features of the windows that end with the post-step, pre-reset states
     valid: jax.Array  # [T, N] bool, false where the state was not finite
     start: jax.Array | None = None  # [T, N] bool, true at an episode's first step; None where nothing asks for it
+    # [T, N, F] compact frames after the steps, x and y 0, in the features' axes; None unless the method follows
+    frame: jax.Array | None = None
+    wanted: jax.Array | None = None  # [T, N, F] the demonstration's at the commanded time, likewise
 
 
 class Expert(NamedTuple):
@@ -30,6 +35,7 @@ class Expert(NamedTuple):
     weight: jax.Array  # [D] feature of a standardized coordinate: root of its multiplicity over sqrt(d)
     horizon: int  # frames in a window, oldest first, D / horizon coordinates each
     share: jax.Array | None = None  # [W] how often each window is drawn, summing to one; evenly where None
+    layout: FrameLayout | None = None  # of a frame's coordinates; None where nothing asks for it
 
     def bank_rows(self, key: jax.Array, size: int) -> jax.Array:
         """Rows of `windows` that make an expert bank, ``[size]`` int32.
@@ -50,6 +56,21 @@ class Expert(NamedTuple):
         return self.windows[jax.random.choice(key, len(self.windows), shape, p=self.share)]
 
 
+class Pretraining(NamedTuple):
+    """What a prior learns of the demonstration before any policy: the same for all runs, so it is kept for the next.
+
+    A state that is not pretrained is pretrained in its first update.
+    """
+
+    iterations: int
+    settings: Mapping[str, Any]  # all that it depends on beside the demonstration, by name
+    # State, key, iteration until which to learn -> state, {"loss": mean per iteration, "skipped": updates left out}
+    advance: Callable[[PriorState, jax.Array, jax.Array | int], tuple[PriorState, Metrics]]
+    finished: Callable[[PriorState], jax.Array]  # scalar bool
+    learned: Callable[[PriorState], Any]  # what is kept, a pytree of arrays
+    put: Callable[[PriorState, Any], PriorState]  # the state of a run with what was kept
+
+
 class MotionPrior(NamedTuple):
     """A learned reward.
 
@@ -60,12 +81,29 @@ class MotionPrior(NamedTuple):
     init: Callable[[jax.Array], PriorState]
     update: Callable[[PriorState, Rollout, jax.Array], tuple[PriorState, jax.Array, Metrics]]
     score: Callable[[PriorState, jax.Array], jax.Array]  # of features [n, D], higher is better, before normalization
+    pretraining: Pretraining | None = None
 
 
 def flatten(rollout: Rollout, stand_in: Float[jax.Array, " D"]) -> Float[jax.Array, "N D"]:
     """All windows of a rollout, ``[T * N, D]``; ``stand_in [D]`` takes the place of those that are not finite."""
     features = jnp.where(rollout.valid[..., None], rollout.features, stand_in)
     return sharding.split(features.reshape(-1, features.shape[-1]))
+
+
+def followed(rollout: Rollout) -> tuple[Float[jax.Array, "T N F"], Float[jax.Array, "T N F"]]:
+    """The frames of a rollout and those that were wanted; where a state was not finite, the wanted one twice."""
+    if rollout.frame is None or rollout.wanted is None:
+        raise ValueError("rollout without frames: expected those that were reached and those that were wanted")
+    return jnp.where(rollout.valid[..., None], rollout.frame, rollout.wanted), rollout.wanted
+
+
+def unscored(method: str) -> Callable[[PriorState, jax.Array], jax.Array]:
+    """The score of a method that compares each step with the demonstration at the same time: it refuses."""
+
+    def score(state, x):
+        raise UserError(f"method {method} scores a step by the time in the clip: a window alone has no score")
+
+    return score
 
 
 class Coupling(NamedTuple):

@@ -1,8 +1,8 @@
 """Score-Matching Motion Priors, as in MimicKit: a diffusion model of the demonstration's windows, then frozen.
 
-The model is pretrained in the first update of a run, before that rollout is scored. Its state holds the iteration, so a
-run that resumes does not pretrain again. The reward falls with the error of the noise that the model finds in a noised
-window, relative to the mean error of the policy's windows so far.
+The model is pretrained before the policy (`MotionPrior.pretraining`); a state that is not is pretrained in its first
+update. The state holds the iteration, so a run that resumes does not pretrain again. The reward falls with the error of
+the noise that the model finds in a noised window, relative to the mean error of the policy's windows so far.
 
 Where this departs from the source: windows are FMP's, with joint velocities and at the control rate, standardized by
 FMP's deviations, and ``smp.network`` may be ``small``. Coordinates that stand twice in the full window count once. The
@@ -19,7 +19,12 @@ from flax import linen
 
 from fmpjax import learning, sharding
 from fmpjax.config import SMP_NETWORKS, Config
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten
+from fmpjax.priors.base import Expert, MotionPrior, Pretraining, Rollout, flatten
+
+# Settings on which the pretrained model depends.
+PRETRAINED_BY = (
+    *("network", "noise_steps", "iterations", "batch", "learning_rate", "weight_decay", "clip_norm", "average"),
+)
 
 
 class SMPState(NamedTuple):
@@ -105,11 +110,11 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         zero, count = jnp.float32(0.0), len(settings.score_steps)
         return SMPState(params, params, optimizer.init(params), jnp.int32(0), zero, jnp.zeros(count), zero)
 
-    def pretrain(state: SMPState, key):
-        """The state after all iterations, and how many updates were left out; nothing where they are done."""
+    def pretrain(state: SMPState, key, until):
+        """The state at an iteration, the sum of the losses and how many updates were left out on the way."""
 
         def step(carry):
-            state, skipped = carry
+            state, total, skipped = carry
             rows_key, step_key, noise_key = jax.random.split(jax.random.fold_in(key, state.iteration), 3)
             x = expert.draw(rows_key, (settings.batch,)) / expert.weight
             at = jax.random.randint(step_key, (settings.batch,), 0, settings.noise_steps)
@@ -131,10 +136,11 @@ def make(expert: Expert, config: Config) -> MotionPrior:
                 iteration=state.iteration + 1,
                 loss=running,
             )
-            return state, skipped + ~taken.finite
+            return state, total + jnp.where(taken.finite, value, 0.0), skipped + ~taken.finite
 
         # A loop that may make no round, not a branch: over several seeds at once a branch would take both ways.
-        return jax.lax.while_loop(lambda carry: carry[0].iteration < settings.iterations, step, (state, jnp.int32(0)))
+        begin = state, jnp.float32(0.0), jnp.int32(0)
+        return jax.lax.while_loop(lambda carry: carry[0].iteration < until, step, begin)
 
     def errors(state: SMPState, x, key):
         """Errors ``[K, n]`` at each noise step of features ``[n, D]``, each step with a noise of its own."""
@@ -160,7 +166,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
 
     def update(state: SMPState, rollout: Rollout, key):
         pretrain_key, noise_key = jax.random.split(key)
-        state, skipped = pretrain(state, pretrain_key)
+        state, _, skipped = pretrain(state, pretrain_key, settings.iterations)
         pool = flatten(rollout, expert.windows[0])
         both = errors(state, jnp.concatenate([pool, expert.windows]), noise_key)
         error, demonstration = both[:, : len(pool)], both[:, len(pool) :]
@@ -181,4 +187,21 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         }
         return state, reward, summary
 
-    return MotionPrior(init, update, score)
+    def advance(state: SMPState, key, until):
+        after, total, skipped = pretrain(state, key, until)
+        # NaN where every update was left out.
+        return after, {"loss": total / (after.iteration - state.iteration - skipped), "skipped": skipped}
+
+    def put(state: SMPState, learned):
+        average, loss = learned
+        return state._replace(params=average, average=average, iteration=jnp.int32(settings.iterations), loss=loss)
+
+    pretraining = Pretraining(
+        iterations=settings.iterations,
+        settings={f"smp.{name}": getattr(settings, name) for name in PRETRAINED_BY},
+        advance=advance,
+        finished=lambda state: state.iteration >= settings.iterations,
+        learned=lambda state: (state.average, state.loss),
+        put=put,
+    )
+    return MotionPrior(init, update, score, pretraining)

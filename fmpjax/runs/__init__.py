@@ -2,6 +2,7 @@
 
 from fmpjax.files import without_places, write
 from fmpjax.provenance import machine, provenance
+from fmpjax.runs import pretraining
 from fmpjax.runs.clock import End
 from fmpjax.runs.folder import Run, check_trainable, default_folder, default_preset, describe, load_motion
 from fmpjax.runs.outputs import course_video, export, finish, video, web
@@ -21,6 +22,7 @@ __all__ = [
     "finish",
     "load_motion",
     "machine",
+    "pretraining",
     "provenance",
     "train",
     "video",

@@ -10,6 +10,8 @@ from fmpjax import config as configuration
 from fmpjax import sharding
 from fmpjax.config import Config
 from fmpjax.errors import UserError
+from fmpjax.logs import Progress
+from fmpjax.runs import pretraining
 from fmpjax.runs.folder import Run
 from fmpjax.trainer import Trainer, TrainState, stack, unstack
 
@@ -35,6 +37,10 @@ class Session:
     def done(self) -> int:
         """Iterations so far."""
         return int(self.states[0].iteration)
+
+    def pretrain(self, progress: Progress) -> None:
+        """Learn what the method learns before any policy, or take it from the cache; nothing where that is done."""
+        self.states = pretraining.pretrained(self.trainer, self.states, [run.folder for run in self.group], progress)
 
     def compile(self, devices: int | None) -> None:
         """Compile the program for a number of devices, all of them for None."""

@@ -60,6 +60,7 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
             run.resumed()
     if live is not None:
         live.open(session)
+    session.pretrain(progress)
     compiling = _compile(session, devices, progress)
     recorders = _recorders(session, progress)
     training = Clock(

@@ -30,6 +30,7 @@ TITLES = {
     "ppo/deviation": "action deviation",
     "ppo/explained_variance": "explained variance",
     "fit/expert_margin": "demonstration's margin, spreads",
+    "pretraining/loss": "pretraining: loss",
 }
 COLUMNS = 4
 SPARSE = 0.5  # a curve with values in fewer rows than this is drawn as points

@@ -214,6 +214,8 @@ def test_the_phase_goes_on_and_ends_the_episode_with_the_clip(phased, walk):
     np.testing.assert_allclose(seen[0], [0, 0, 0, 1, 1], atol=1e-6)
     assert phased.command.size == seen.shape[1] == 5 and float(seen[1, 1]) == pytest.approx(1, abs=1e-3)
     frame = jnp.zeros((3, FrameLayout.of(phased.robot).size))
+    np.testing.assert_array_equal(phased.command.wanted(state), [1, last - 1, 1])
+    np.testing.assert_array_equal(phased.command.wanted(jnp.array([last - 1, last])), last)
     state, over, _ = phased.command.advance(state, None, frame)
     assert state.tolist() == [1, last - 1, 1] and not over.any()
     assert phased.command.advance(state, None, frame).over.tolist() == [False, True, False]
@@ -298,6 +300,7 @@ def test_product_and_sum():
     np.testing.assert_array_equal(commands.combine(CommandConfig(), prior, obeyed), [0.5, 0.5])
     joined = commands.combine(CommandConfig(combine="sum", weight=2.0), prior, obeyed)
     np.testing.assert_array_equal(joined, [2.0, 2.5])
+    np.testing.assert_array_equal(commands.combine(CommandConfig(combine="prior"), prior, obeyed), prior)
 
 
 @pytest.mark.parametrize(

@@ -142,7 +142,11 @@ def test_every_rule_is_tried_at_its_bound():
 
 
 @pytest.mark.parametrize(
-    "method", [*("fmp", "endpoint", "value", "bank16", "barycentric", "amp", "gail", "wail", "pwil", "smp")]
+    "method",
+    [
+        *("fmp", "endpoint", "value", "bank16", "barycentric", "amp", "gail", "wail", "pwil", "smp"),
+        *("add", "tracking"),
+    ],
 )
 def test_a_healthy_course_earns_one_sentence(method):
     assert diagnose.report(course(method)) == ["No symptom: every figure that was checked is in its healthy range."]

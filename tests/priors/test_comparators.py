@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fmpjax import priors, transport
+from fmpjax import priors, robots, transport
 from fmpjax.checkpoint import Checkpoints
-from fmpjax.config import AMPConfig
+from fmpjax.config import FOLLOWERS, AMPConfig
+from fmpjax.errors import UserError
+from fmpjax.frames import FrameLayout
 from fmpjax.priors import Expert, adversary, amp, barycentric, empirical
 from fmpjax.trainer import TrainState
 from tests.helpers import COUNT, SMALL, STEPS, expert_of, rollout_of
@@ -30,14 +32,21 @@ def test_every_prior_keeps_the_contract(cloud, method, tmp_path):
     if method == "barycentric":
         expert = expert_of(jnp.tile(expert.windows, (1, 2)), horizon=2)
         points = np.tile(points, (1, 2))
+    if method in FOLLOWERS:
+        layout = FrameLayout.of(robots.load("strider"))
+        expert = expert_of(np.resize(expert.windows, (32, layout.size)))._replace(layout=layout)
+        points = np.resize(points, (len(points), layout.size))
     prior = priors.make(method, expert, SMALL)
     valid = np.ones((STEPS, COUNT), bool)
     valid[2, 5] = False
     points = points.reshape(STEPS, COUNT, -1).copy()
     points[2, 5] = np.nan
+    rollout = rollout_of(points, valid)
+    if method in FOLLOWERS:
+        rollout = rollout._replace(frame=rollout.features, wanted=jnp.zeros_like(rollout.features))
     update = jax.jit(prior.update)
     state = jax.jit(prior.init)(jax.random.PRNGKey(0))
-    new, reward, metrics = update(state, rollout_of(points, valid), jax.random.PRNGKey(1))
+    new, reward, metrics = update(state, rollout, jax.random.PRNGKey(1))
     assert reward.shape == (STEPS, COUNT)
     assert np.isfinite(reward).all()
     assert (reward >= 0).all()
@@ -47,10 +56,14 @@ def test_every_prior_keeps_the_contract(cloud, method, tmp_path):
     assert jax.tree.structure(new) == jax.tree.structure(state)
     same = lambda a, b: a.shape == b.shape and a.dtype == b.dtype  # noqa: E731 - what a scan's carry must keep
     assert jax.tree.all(jax.tree.map(same, new, state))
-    again = update(state, rollout_of(points, valid), jax.random.PRNGKey(1))
+    again = update(state, rollout, jax.random.PRNGKey(1))
     np.testing.assert_array_equal(again[1], reward)
-    scores = jax.jit(prior.score)(new, rollout_of(np.nan_to_num(points)).features.reshape(STEPS * COUNT, -1))
-    assert scores.shape == (STEPS * COUNT,)
+    windows = rollout_of(np.nan_to_num(points)).features.reshape(STEPS * COUNT, -1)
+    if method in FOLLOWERS:
+        with pytest.raises(UserError, match="a window alone has no score"):
+            jax.jit(prior.score)(new, windows)
+    else:
+        assert jax.jit(prior.score)(new, windows).shape == (STEPS * COUNT,)
     run = TrainState(None, new, None, jax.random.PRNGKey(2), jnp.int32(1), jnp.int32(0))
     Checkpoints(tmp_path).save(run)
     jax.tree.map(np.testing.assert_array_equal, Checkpoints(tmp_path).restore(run), run)

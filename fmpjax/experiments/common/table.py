@@ -30,6 +30,8 @@ TITLES = {
     "wail": "WAIL",
     "pwil": "PWIL",
     "smp": "SMP",
+    "add": "ADD",
+    "tracking": "Tracking",
 }
 
 
