@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +38,7 @@ def git(*arguments: str) -> str:
 
 
 @contextlib.contextmanager
-def checked_out(commit: str) -> Iterator[Path]:
+def checked_out(commit: str) -> Generator[Path]:
     """A temporary folder with the files of a commit."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "baseline"

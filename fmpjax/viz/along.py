@@ -1,6 +1,6 @@
 """What changes along a clip."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from fmpjax.errors import UserError
 
 
-def draw(path: Path, seconds: float, curves: dict[str, Sequence[float]]) -> Path:
+def draw(path: Path, seconds: float, curves: Mapping[str, Sequence[float]]) -> Path:
     """Draw curves by title, one below the other, over a clip's equal parts; the path written.
 
     Args:
