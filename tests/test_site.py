@@ -30,7 +30,7 @@ def hooks():
         ("index.md", "![a](docs/play.jpg)", "![a](play.jpg)", {"docs/play.jpg"}),
         ("play.md", "[a](../CHANGELOG.md)", "[a](changelog.md)", {"CHANGELOG.md"}),
         ("changelog.md", "[a](docs/play.md)", "[a](play.md)", {"docs/play.md"}),
-        ("play.md", "[a](../experiments)", "[a](experiments/index.md)", {"experiments"}),
+        ("play.md", "[a](../benchmarks)", "[a](benchmarks/index.md)", {"benchmarks"}),
         ("play.md", "[a](../robots/strider)", "[a](robots/strider/index.md)", {"robots/strider"}),
         ("experiments/index.md", "[a](table1.toml)", "[a](table1.toml.md)", {"experiments/table1.toml"}),
         ("experiments/index.md", "[a](../docs/play.md)", "[a](../play.md)", {"docs/play.md"}),
