@@ -29,7 +29,6 @@ SETTINGS: Mapping[str, Any] = {
     "features.axes": "heading",
     "evaluations": (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
 }
-METHOD_SETTINGS: Mapping[str, Mapping[str, Any]] = {}  # by method, what it cannot do without; on all motions
 SEEDS = (0, 1, 2, 3, 4)
 SMOKE = Specification(
     preset="smoke",
@@ -123,7 +122,7 @@ def plan(specification: Specification, motions: Sequence[str]) -> list[Cell]:
             raise UserError(f"motions {named[name]!r} and {motion!r} are both called {name!r}: expected two names")
         named[name] = motion
     variants = {name: {"motion": library.listed(motion)} for name, motion in named.items()}
-    specification = dataclasses.replace(specification, variants=variants, by_method=METHOD_SETTINGS)
+    specification = dataclasses.replace(specification, variants=variants)
     planned = cells.plan(specification)
     # Bad motions are refused now, and not by a cell each.
     for cell in {cell.variant: cell for cell in planned}.values():

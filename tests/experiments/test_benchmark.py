@@ -6,7 +6,6 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
 import time
 
@@ -43,18 +42,12 @@ def test_all_methods_have_one_setting_for_all_motions():
         benchmark.MOTIONS,
     )
     assert len(planned) == len(priors.METHODS) * 4 * 2 * 2
-    configs = [configuration.flatten(cell.config) for cell in planned]
-    apart = {key for key in configs[0] if len({str(config[key]) for config in configs}) > 1}
-    assert apart == {"method", "motion", "seed", "env.reset"}
+    for method in priors.METHODS:
+        configs = [configuration.flatten(cell.config) for cell in planned if cell.config.method == method]
+        apart = {key for key in configs[0] if len({str(config[key]) for config in configs}) > 1}
+        assert apart == {"motion", "seed", "env.reset"}
     assert planned[0].name == f"{priors.METHODS[0]}-dataset-walk/seed0" and planned[0].config.features.axes == "heading"
     assert len(planned[0].config.evaluations) == 10
-
-
-def test_what_a_method_needs_holds_on_every_motion(monkeypatch):
-    monkeypatch.setattr(benchmark, "METHOD_SETTINGS", {"amp": {"amp.updates": 7}})
-    planned = small("fmp", "amp", motions=("walk", "slow_walk"))
-    assert [cell.config.amp.updates for cell in planned if cell.config.method == "amp"] == [7, 7]
-    assert [cell.config.amp.updates for cell in planned if cell.config.method == "fmp"] == [2, 2]
 
 
 def test_motions_of_ones_own_join_the_default_ones(tmp_path):
@@ -117,6 +110,17 @@ def test_a_cell_that_another_process_has_is_refused(tmp_path, monkeypatch):
     with FileLock(tmp_path / "fmp-dataset-walk" / "seed0.lock"):
         with pytest.raises(UserError, match="cell fmp-dataset-walk/seed0 is being run by another process: wait"):
             mine.run()
+
+
+def test_a_seed_that_another_command_has_trained_is_not_begun_again(tmp_path):
+    """Two seeds that were to be trained at once: the first has iterations, the second nothing."""
+    mine = task(tmp_path, finished=False)
+    run = tmp_path / mine.cells[0]
+    (run / "config.json").write_text("{}")
+    both = Task(str(tmp_path), (*mine.cells, "fmp-dataset-walk/seed1"), 10, ())
+    with pytest.raises(UserError, match="cells .*seed0, .*seed1 have not got as far as each other, since another"):
+        both.run()
+    assert (run / "metrics.csv").exists()
 
 
 def test_a_process_that_ends_before_its_cell_has_failed(tmp_path):
@@ -259,26 +263,30 @@ def test_a_new_prior_is_one_file_and_one_line(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @needs_submitit
-def test_a_killed_cell_continues_to_the_same_end(tmp_path):
-    """The benchmark and its cell are killed; the same command brings the cell to its end, and then does nothing."""
-    out = tmp_path / "out"
-    settings = [f"--set={key}={value}" for key, value in SMALL.items()]
-    command = [
-        sys.executable, "-m", "fmpjax.experiments.benchmark", "--smoke", "--out", str(out), "--only",
-        "--motion", "walk", "--methods", "barycentric", "--seeds", "0", *settings, "--cluster", "local",
-    ]  # fmt: skip
-    run = out / "barycentric-dataset-walk" / "seed0"
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
-    until = time.monotonic() + 300
-    while not (run / "checkpoints").exists() and process.poll() is None and time.monotonic() < until:
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGKILL)  # and with it submitit's processes
+def test_a_killed_cell_continues_to_its_end_and_is_then_left_alone(tmp_path, capsys):
+    """A process of this machine is killed after its first checkpoint; submitit's continues from there."""
+    planned, run = small("barycentric"), tmp_path / "barycentric-dataset-walk" / "seed0"
+    engine = engines.Processes(1)
+    engine.start(cells._tasks(planned, tmp_path, together=False))
+    until = time.monotonic() + 400
+
+    def saved():
+        return [int(path.name) for path in run.glob("checkpoints/*") if path.name.isdigit()]
+
+    while not saved() and engine.running() and time.monotonic() < until:
+        time.sleep(0.02)
+        assert engine.ended() == [], (tmp_path / "barycentric-dataset-walk" / "seed0.log").read_text()
+    ((_, process),) = engine._running.values()
+    os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    assert not (out / "benchmark.csv").exists()
-    for said in ("1 cells, 0 of them finished before", "1 cells, 1 of them finished before"):
-        stamp = run.stat().st_mtime_ns
-        done = subprocess.run(command, capture_output=True, text=True, timeout=280)
-        assert done.returncode == 0 and said in done.stdout, done.stderr
-    assert run.stat().st_mtime_ns == stamp
+    assert 0 < max(saved()) < 10 and not cells.finished(planned[0], tmp_path)
+
+    cells.run(planned, tmp_path, cluster="local")
+    assert cells.finished(planned[0], tmp_path)
     rows = [line.split(",") for line in (run / "metrics.csv").read_text().splitlines()]
-    assert [line[0] for line in rows[1:]] == ["2", "4", "6", "8", "10"]
+    assert [row[0] for row in rows[1:]] == ["2", "4", "6", "8", "10"]
+    (again,) = json.loads((run / "provenance.json").read_text())["resumed"]
+    assert again["command"].startswith("fmpjax train --preset smoke --set=") and again["command"].endswith("--resume")
+    cells.run(planned, tmp_path, cluster="local")
+    assert "1 cells, 1 of them finished before" in capsys.readouterr().out
+    assert len(list((tmp_path / "jobs").glob("*_submitted.pkl"))) == 1

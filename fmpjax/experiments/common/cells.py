@@ -39,7 +39,6 @@ class Specification:
     seeds: tuple[int, ...] = (0,)
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # section.field: value, of every cell
     variants: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # by name, of its cells
-    by_method: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # settings of its cells
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +95,7 @@ def _check(path: Path, key: str, value: Any) -> None:
         good, expected = isinstance(value, list) and all(type(v) is int for v in value), "a list of whole numbers"
     elif key == "settings":
         good, expected = isinstance(value, dict), "a table of section.field = value"
-    elif key in ("variants", "by_method"):
+    elif key == "variants":
         good = isinstance(value, dict) and all(isinstance(v, dict) for v in value.values())
         expected = "tables of section.field = value"
     elif key == "transitions":
@@ -122,7 +121,7 @@ def plan(specification: Specification) -> list[Cell]:
         changes: dict[str, Any] = {"motion": s.motion, "method": method, "env.reset": reset, "seed": seed}
         changes |= {"frames": s.frames} if s.frames else {}
         changes |= {"transitions": s.transitions} if s.transitions else {}
-        changes |= {**s.settings, **s.by_method.get(method, {}), **variants[variant]}
+        changes |= {**s.settings, **variants[variant]}
         group = "-".join(part for part in (method, reset, variant) if part)
         cells.append(Cell(f"{group}/seed{seed}", variant, configuration.preset(s.preset, **changes), changes))
     if not cells:

@@ -49,7 +49,7 @@ class Task:
         """Train the cells to their end, where they are not there yet.
 
         Raises:
-          UserError: another process has one of the cells.
+          UserError: another process has one of the cells, or had some of them.
           ChildProcessError: the training failed, or was stopped; the log says why.
         """
         with contextlib.ExitStack() as locks:
@@ -75,6 +75,11 @@ class Task:
         folders = [Path(self.folder) / name for name in self.cells]
         begun = all((folder / "config.json").exists() for folder in folders)
         if not begun:
+            if any(iterations(folder) for folder in folders if (folder / "config.json").exists()):
+                raise UserError(
+                    f"cells {', '.join(self.cells)} have not got as far as each other, since another command trained "
+                    "some of them: start the command again"
+                )
             # A process that was killed while it made the folders left no more than a beginning in them.
             for folder in folders:
                 shutil.rmtree(folder, ignore_errors=True)
