@@ -44,7 +44,9 @@ class Recorder:
         self._evaluate, self._note = evaluate, note
         self.log = MetricsLog(run.folder, list(columns), iteration, keep=keep)
         rows = [row for row in self.log.rows if row.get("eval/quality")]
-        self.best = max((float(row["eval/quality"]) for row in rows), default=-1.0)  # quality of the best policy
+        # Rows of earlier versions have no score with a command: the next policy replaces theirs.
+        name = "eval/quality" if config.command.kind == "none" else "eval/score"
+        self.best = max((float(row[name]) for row in rows if row.get(name)), default=-1.0)  # score of the best policy
         self.evaluated = max((int(row["iteration"]) for row in rows), default=0)  # the last iteration evaluated
 
     def record(
@@ -65,9 +67,9 @@ class Recorder:
         evaluation, self.evaluated = self._evaluate(state.ppo), at.done
         self._note(f"evaluation at {at.transitions:,} transitions, {self._label}{clock(at.seconds)}:")
         self._note(table(evaluation))
-        better = evaluation.quality >= self.best
+        better = evaluation.score >= self.best
         if better:
-            self.best = evaluation.quality
+            self.best = evaluation.score
         figures = {f"eval/{name}": float(value) for name, value in evaluation.as_dict().items()}
         self._write(at, {**row, **figures}, state, better=better)
         course = diagnose.Course(self.log.rows, self._config, json.loads(evaluation.to_json()))
