@@ -3,10 +3,11 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 
+from fmpjax import config as configuration
 from fmpjax import diagnose
 from fmpjax.config import Config
 from fmpjax.evaluate import Evaluation, table
-from fmpjax.logs import MetricsLog, clock
+from fmpjax.logs import MetricsLog, Mirror, clock
 from fmpjax.ppo import PPOState
 from fmpjax.runs.clock import Clock
 from fmpjax.runs.folder import Run
@@ -27,6 +28,7 @@ class Recorder:
         note: Callable[[str], None],
         label: str = "",
         keep: bool = True,
+        logger: str | None = None,
     ):
         """Continue the run's log from an iteration.
 
@@ -39,10 +41,12 @@ class Recorder:
           note: says a line.
           label: says which run it is, where there are several.
           keep: False where another process writes.
+          logger: "wandb" or "trackio" gets the rows of the log, too.
         """
         self._run, self._config, self._label, self._keep = run, config, label, keep
         self._evaluate, self._note = evaluate, note
-        self.log = MetricsLog(run.folder, list(columns), iteration, keep=keep)
+        mirror = Mirror(logger, run.folder, configuration.flatten(run.config)) if logger and keep else None
+        self.log = MetricsLog(run.folder, list(columns), iteration, keep=keep, mirror=mirror)
         rows = [row for row in self.log.rows if row.get("eval/quality")]
         # Rows of earlier versions have no score with a command: the next policy replaces theirs.
         name = "eval/quality" if config.command.kind == "none" else "eval/score"
