@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from fmpjax import config as configuration
-from fmpjax import runs
+from fmpjax import logs, runs
 from fmpjax.config import Config
 from fmpjax.errors import UserError
 from fmpjax.motion import library
@@ -20,6 +20,7 @@ def train(
     folder: str | Path | None = None,
     minutes: float | None = None,
     resume: bool = False,
+    logger: str | None = None,
     **settings: Any,
 ) -> Run:
     """Train a policy from a demonstration, as the command ``fmpjax train`` does, and return its run.
@@ -34,6 +35,7 @@ def train(
       folder: the run folder; by default ``runs/METHOD-DATE-TIME``.
       minutes: time that the training may take, its compilation and evaluations included.
       resume: continue the run in ``folder``, with the settings that it has.
+      logger: "wandb" or "trackio" gets the figures of ``metrics.csv``, too; docs/metrics.md.
       **settings: changes of the settings: ``method="amp"``, ``motion="walk.npz"``, ``**{"ppo.discount": 0.98}``.
 
     Returns:
@@ -41,11 +43,12 @@ def train(
 
     Raises:
       UserError: a setting is unknown or wrong, ``folder`` holds a run already, or none to resume, too much was not
-        finite, or memory is too small; what was saved stays.
+        finite, memory is too small, or a logger is missing; what was saved stays.
     """
     began = time.monotonic()
     if minutes is not None and not minutes > 0:
         raise UserError(f"minutes is {minutes:g}: expected more than 0")
+    logs.check_logger(logger)
     if resume:
         if folder is None or config or command or preset or settings:
             raise UserError("resume continues a run with its own settings: expected its folder and no settings")
@@ -55,7 +58,7 @@ def train(
             raise UserError("command goes with a preset: of a Config, set command.kind, motion and the axes yourself")
         run = _created(config, preset, folder, configuration.commanded(command, settings))
     left = None if minutes is None else minutes - (time.monotonic() - began) / 60
-    if runs.train(run, resume=resume, minutes=left) is not runs.End.SIGNAL:
+    if runs.train(run, resume=resume, minutes=left, logger=logger) is not runs.End.SIGNAL:
         runs.finish(run)
     return run
 

@@ -149,6 +149,8 @@ class Train:
     """Show the policy as it trains in a page of the browser; docs/play.md."""
     port: int = 8080
     """Port of that page; 0 for any that is free."""
+    logger: Annotated[str | None, default("none")] = None
+    """`wandb` (Weights & Biases) or `trackio`, which get the figures of metrics.csv; they stay on this machine."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Any other setting as section.field=value; `fmpjax settings` explains all of them."""
 
@@ -165,6 +167,10 @@ class Train:
             if self.distributed:
                 raise UserError("--live does not go with --distributed: `fmpjax play RUN` shows the checkpoints")
             play.check_installed()
+        if self.logger is not None:
+            from fmpjax import logs
+
+            logs.check_logger(self.logger)
         began = time.monotonic()
         self._connect()
         runs = runs_module()
@@ -177,7 +183,9 @@ class Train:
         minutes = None if self.minutes is None else self.minutes - (time.monotonic() - began) / 60
         page = runs.Live(group, self.port) if self.live else None
         with page or contextlib.nullcontext():
-            end = runs.train(*group, resume=self.resume, minutes=minutes, devices=devices, live=page)
+            end = runs.train(
+                *group, resume=self.resume, minutes=minutes, devices=devices, live=page, logger=self.logger
+            )
         from fmpjax import sharding
 
         # Who sends a signal wants the process to end, not to film.
@@ -254,6 +262,8 @@ class Train:
         from fmpjax.motion import library
 
         config = configuration.preset(self.preset or runs.default_preset(), **self._changes())
+        if self.accept_license:
+            library.accept_license(config.motion)
         config = configuration.with_changes(config, {"motion": library.listed(config.motion)})
         runs.check_trainable(config, self.seeds or 1)
         if devices != 1:
@@ -262,8 +272,6 @@ class Train:
         folder = self.run or runs.default_folder(config)
         if self.seeds is None:
             return [runs.Run.create(folder, config)]
-        if self.accept_license:
-            library.accept_license(config.motion)
         seeds = range(config.seed, config.seed + self.seeds)
         configs = [configuration.validate(dataclasses.replace(config, seed=seed)) for seed in seeds]
         return [runs.Run.create(folder / f"seed{each.seed}", each) for each in configs]

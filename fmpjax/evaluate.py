@@ -46,6 +46,7 @@ class Episodes(NamedTuple):
     clip: np.ndarray  # [N] index of the demonstration that it starts in, 0 for the default pose
     starts: tuple[Start, ...] = ()  # every size, the headline's included, the smallest first
     targets: np.ndarray | None = None  # [T, n, J] joint targets of the detailed episodes, rad; None: not recorded
+    obedience: np.ndarray | None = None  # [N] mean of the command's reward while up; None without a command
 
 
 class Share(NamedTuple):
@@ -87,20 +88,27 @@ class Evaluation:
     power: float  # W, mechanical, of the servos
     joint_ranges: tuple[float, ...]  # degrees, six sagittal joints
     expert_ranges: tuple[float, ...]  # degrees
+    obedience: float | None = None  # mean of the command's reward in the steps before a fall; None without a command
     starts: tuple[Start, ...] = ()  # falls at every size of perturbation
     motions: tuple[Share, ...] = ()  # where there are several
 
     @property
     def quality(self) -> float:
-        """Share of surviving episodes times one less the relative error of the late speed: what "best" means.
+        """Share of surviving episodes times one less the relative error of the late speed.
 
         Too fast is no better than too slow. Where the demonstration turns, speeds are along the own heading.
         """
         return (1.0 - self.falls / self.episodes) * max(0.0, 1.0 - pace_error(vars(self)))
 
+    @property
+    def score(self) -> float:
+        """What "best" means: the quality, times the obedience where there is a command."""
+        return self.quality * (1.0 if self.obedience is None else self.obedience)
+
     def as_dict(self) -> dict[str, float]:
         """Scalar figures, by name; `names` says which."""
         values = {name: value for name, value in vars(self).items() if not isinstance(value, tuple)}
+        values = _told(values | {"score": self.score})
         counts = [count for start in self.starts for count in (start.falls, start.episodes)]
         sized = _sized(start.noise for start in self.starts)
         return values | {"quality": self.quality} | dict(zip(sized, counts, strict=True))
@@ -108,6 +116,7 @@ class Evaluation:
     def record(self) -> dict[str, Any]:
         """All figures, for JSON; what is not defined is NaN."""
         values = vars(self) | {"quality": self.quality, "starts": [start._asdict() for start in self.starts]}
+        values = _told(values | {"score": self.score})
         del values["motions"]
         motions = [share._asdict() for share in self.motions]
         return values | ({"motions": motions} if motions else {})
@@ -127,7 +136,16 @@ def pace_error(figures: Mapping[str, Any]) -> float:
 def names(config: Config) -> list[str]:
     """Names of an evaluation's scalar figures, those of `Evaluation.as_dict`."""
     plain = [field.name for field in dataclasses.fields(Evaluation) if "tuple" not in str(field.type)]
-    return [*plain, "quality", *_sized(sorted(config.evaluation_noise))]
+    obedience = None if config.command.kind == "none" else 0.0
+    known = _told(dict.fromkeys([*plain, "score", "quality"]) | {"obedience": obedience})
+    return [*known, *_sized(sorted(config.evaluation_noise))]
+
+
+def _told(values: dict[str, Any]) -> dict[str, Any]:
+    """Figures by name, without those that only runs with a command have where there is none."""
+    if values["obedience"] is not None:
+        return values
+    return {name: value for name, value in values.items() if name not in ("obedience", "score")}
 
 
 def _sized(sizes: Iterable[float]) -> list[str]:
@@ -185,31 +203,35 @@ class Evaluator:
         policy = self.trainer.ppo.act(state, deterministic=True)
 
         def step(carry, drawn):
-            now, alive, fell, length = carry
+            now, alive, fell, length, earned = carry
             taken = frozen.step(self.trainer, env, policy, now, alive, drawn)
+            if taken.earned is not None:
+                earned = earned + jnp.where(alive, taken.earned, 0.0)
             sim, targets = taken.now.physics, env.actions(taken.action)[:headline][:DETAILED]
-            record = sim.qpos[:headline], sim.qvel[:headline], targets
-            return (taken.now, taken.alive, fell | taken.fell, length + alive), record
+            after = (taken.now, taken.alive, fell | taken.fell, length + alive, earned)
+            return after, (sim.qpos[:headline], sim.qvel[:headline], targets)
 
         alive = jnp.ones(len(self.rows), bool)
-        (_, _, fell, length), (qpos, qvel, targets) = jax.lax.scan(
+        nothing = None if env.command is None else jnp.zeros(len(self.rows))
+        (_, _, fell, length, earned), (qpos, qvel, targets) = jax.lax.scan(
             step,
-            (start, alive, ~alive, jnp.zeros(len(self.rows), jnp.int32)),
+            (start, alive, ~alive, jnp.zeros(len(self.rows), jnp.int32), nothing),
             env.disturbance_draws(jnp.asarray(self._key), env.config.episode_steps, len(self.rows)),
             length=env.config.episode_steps,
         )
-        return qpos, qvel, targets, length, fell, start.physics.qpos, start.history
+        return qpos, qvel, targets, length, fell, start.physics.qpos, start.history, earned
 
     def play(self, state: PPOState) -> Episodes:
         """First episodes under ``state``'s mean action."""
         headline = slice(0, self.count)
-        qpos, qvel, targets, *each = map(np.asarray, self._play(state))
+        qpos, qvel, targets, *each, earned = jax.device_get(self._play(state))
         length, fell, start_qpos, history = (values[headline] for values in each)
         clip = self.trainer.env.clip_of(self.rows[headline])
         ends = np.cumsum(list(self._sizes.values()))
         falls = [int(part.sum()) for part in np.split(each[1], ends[:-1])]
         starts = sorted(map(Start, self._sizes, self._sizes.values(), falls))
-        return Episodes(qpos, qvel, length, fell, start_qpos, history, clip, tuple(starts), targets)
+        obedience = None if earned is None else earned[headline] / length
+        return Episodes(qpos, qvel, length, fell, start_qpos, history, clip, tuple(starts), targets, obedience)
 
     def __call__(self, state: PPOState) -> Evaluation:
         return self.measure(self.play(state))
@@ -261,6 +283,7 @@ class Evaluator:
             **self._effort(played, length),
             joint_ranges=tuple(np.degrees(metrics.mean_ranges(ranges)).round(2).tolist()),
             expert_ranges=tuple(np.degrees(expert).round(2).tolist()),
+            obedience=None if played.obedience is None else float(played.obedience.mean()),
             starts=played.starts,
             motions=self._shares(played, np.where(turns, path_speed, speed), own_speed),
         )
@@ -353,6 +376,8 @@ def table(evaluation: Evaluation) -> str:
         ("leg ranges (hip, knee, ankle; L, R)", " ".join(f"{r:.0f}" for r in e.joint_ranges), "degrees"),
         ("expert's leg ranges", " ".join(f"{r:.0f}" for r in e.expert_ranges), "degrees"),
     ]
+    if e.obedience is not None:
+        rows.append(("obedience", f"{e.obedience:.3f}", "mean of the command's reward before a fall"))
     rows += [
         (f"falls at joint noise of {start.noise:g} rad", f"{start.falls} of {start.episodes}", "")
         for start in e.starts

@@ -1,6 +1,8 @@
-"""A run's metrics: rows of a CSV file, TensorBoard scalars, and a line for people."""
+"""A run's metrics: rows of a CSV file, TensorBoard scalars, W&B or trackio where asked for, and a line for people."""
 
 import csv
+import hashlib
+import importlib.util
 import math
 import os
 import sys
@@ -13,17 +15,90 @@ from tensorboardX import SummaryWriter
 
 from fmpjax.errors import UserError
 
+LOGGERS = ("wandb", "trackio")
+PROJECT = "fmpjax"  # under which a logger lists the runs
 _FIRST = ("iteration", "transitions", "seconds")
+
+
+def check_logger(name: str | None) -> None:
+    """Refuse a logger that is unknown or not installed; None is none.
+
+    Raises:
+      UserError: it is.
+    """
+    if name is not None and name not in LOGGERS:
+        raise UserError(f"logger is {name!r}: expected one of {', '.join(LOGGERS)}")
+    if name is not None and importlib.util.find_spec(name) is None:
+        raise UserError(f"logger {name!r} needs the package {name}, which is missing: pip install 'fmpjax[loggers]'")
+
+
+class Mirror:
+    """A run of W&B or of trackio that gets the rows of ``metrics.csv``.
+
+    It stays on this machine: W&B's rows in ``wandb/`` of the run folder, trackio's in its own folder.
+    ``WANDB_MODE=online`` and ``TRACKIO_SPACE_ID`` send them elsewhere. A resumed run continues its run there. Where a
+    row cannot be logged, a line says so, and the training continues without the logger.
+    """
+
+    def __init__(self, name: str, run: Path, settings: Mapping[str, Any]):
+        """Open the logger's run.
+
+        Args:
+          name: of `LOGGERS`.
+          run: the run folder, whose place tells runs of one name apart.
+          settings: of the run, by name.
+
+        Raises:
+          UserError: it cannot be opened.
+        """
+        self._name = name
+        try:
+            self._run: Any = _opened(name, run, dict(settings))
+        except Exception as error:  # each logger has errors of its own
+            raise UserError(f"logger {name!r} cannot start ({error}): expected one that works, or none") from error
+
+    def write(self, row: Mapping[str, Any]) -> None:
+        """Log a row of the CSV file; its step is the number of transitions."""
+        if self._run is None:
+            return
+        try:
+            self._run.log({name: float(value) for name, value in row.items()}, step=int(row["transitions"]))
+        except Exception as error:  # a logger's fault must not end a training
+            print(f"{self._name} failed ({error}): no more rows are logged there", file=sys.stderr, flush=True)
+            self._run = None
+
+    def close(self) -> None:
+        """End the logger's run."""
+        if self._run is not None:
+            self._run.finish()
+
+
+def _opened(name: str, run: Path, settings: dict[str, Any]) -> Any:
+    """A logger's run, with ``log(figures, step=)`` and ``finish()``."""
+    place = run.resolve()
+    identity = hashlib.sha256(str(place).encode()).hexdigest()[:12]
+    if name == "wandb":
+        import wandb
+
+        return wandb.init(
+            project=PROJECT, name=place.name, id=identity, resume="allow", config=settings, dir=str(run),
+            mode=os.environ.get("WANDB_MODE", "offline"), reinit="create_new",
+        )  # fmt: skip
+    import trackio
+
+    return trackio.init(PROJECT, f"{place.name}-{identity}", resume="allow", config=settings, embed=False)
 
 
 class MetricsLog:
     """``metrics.csv`` and ``tensorboard/`` of a run folder; a resumed run continues at its checkpoint.
 
-    With ``keep=False`` nothing is written: another process does.
+    With ``keep=False`` nothing is written: another process does. A ``mirror`` gets each new row, too.
     """
 
-    def __init__(self, run: Path, columns: list[str], iteration: int = 0, *, keep: bool = True):
-        self._keep = keep
+    def __init__(
+        self, run: Path, columns: list[str], iteration: int = 0, *, keep: bool = True, mirror: Mirror | None = None
+    ):
+        self._keep, self._mirror = keep, mirror
         self._path = run / "metrics.csv"
         self._columns = [*_FIRST, *columns]
         rows = self.read(self._path) if iteration else []
@@ -65,10 +140,14 @@ class MetricsLog:
             if not math.isnan(value):
                 self._board.add_scalar(name, value, iteration if transitions is None else transitions)
         self._board.flush()
+        if self._mirror is not None:
+            self._mirror.write(row)
 
     def close(self) -> None:
         if self._keep:
             self._board.close()
+            if self._mirror is not None:
+                self._mirror.close()
 
     @staticmethod
     def read(path: Path) -> list[dict[str, str]]:

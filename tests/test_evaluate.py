@@ -105,6 +105,28 @@ def test_demonstration_states_are_the_headline_as_they_are():
     assert (qpos[7:] != trainer.clip.qpos[evaluator.rows[7:]].astype(np.float32))[:, 7:].all()
 
 
+def test_obedience_is_the_mean_reward_of_the_command_before_a_fall():
+    """Nothing moves, so each episode's error stays what it is at the start; who is off its pose falls in one step."""
+    trainer = trainer_of(**{"command.kind": "velocity", "evaluation_noise": (0.0,)})
+    evaluator, state = Evaluator(trainer, 5), trainer.init().ppo
+    start, expected = evaluator.start(), []
+    off = np.abs(np.asarray(start.physics.qpos)[:, 7] - trainer.env.physics.pose)
+    trainer.env.physics.limit = float(np.median(off))
+    told = start.command
+    for _ in range(60):
+        told, _, earned = trainer.env.command.advance(told, None, start.observed.frame)
+        expected.append(np.asarray(earned))
+    played = evaluator.play(state)
+    up = ~played.fell
+    assert 0 < up.sum() < 5 and (played.length[up] == 60).all() and (played.length[~up] == 1).all()
+    np.testing.assert_allclose(played.obedience[up], np.mean(expected, axis=0)[up], rtol=1e-5)
+    np.testing.assert_allclose(played.obedience[~up], expected[0][~up], rtol=1e-5)
+    found = evaluator.measure(played)
+    assert found.obedience == pytest.approx(played.obedience.mean())
+    assert set(found.as_dict()) == set(evaluate.names(trainer.config)) >= {"obedience", "score"}
+    assert "obedience" in evaluate.table(found)
+
+
 @pytest.mark.parametrize(
     ("reset", "noise", "expected"),
     [

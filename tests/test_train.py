@@ -562,7 +562,7 @@ def test_memory_that_runs_out_leaves_the_last_checkpoint_good(trained, tmp_path,
     ],
 )
 def test_quality(falls, speed, demonstration, expected):
-    names = [f.name for f in dataclasses.fields(Evaluation) if f.name not in ("starts", "motions")]
+    names = [f.name for f in dataclasses.fields(Evaluation) if f.name not in ("obedience", "starts", "motions")]
     nothing = dict.fromkeys(names, 0.0)
     known = {"episodes": 10, "falls": falls, "late_speed": speed, "demonstration_speed": demonstration}
     assert Evaluation(**nothing | known).quality == pytest.approx(expected)

@@ -18,7 +18,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import unquote, urlsplit
+from urllib.parse import SplitResult, unquote, urlsplit
 
 from fmpjax import files, machine
 from fmpjax.errors import UserError
@@ -51,13 +51,13 @@ def file_name(name: str | os.PathLike) -> str:
     """The file's name at the end of an address or a path; what is not printable is left out."""
     if not is_address(name):
         return Path(name).name
-    end = Path(unquote(urlsplit(str(name)).path)).name
+    end = Path(unquote(_split(str(name)).path)).name
     return "".join(sign for sign in end if sign.isprintable())
 
 
 def shareable(name: str) -> bool:
     """Whether a name is an address without a password or a key in it, which others may see."""
-    parts = urlsplit(name) if is_address(name) else None
+    parts = _split(name) if is_address(name) else None
     return parts is not None and not parts.query and (parts.scheme == "hf" or "@" not in parts.netloc)
 
 
@@ -191,9 +191,20 @@ def _accepted() -> dict[str, str]:
 # --- the servers -----------------------------------------------------------------------------------------------------
 
 
+def _split(address: str) -> SplitResult:
+    """The parts of an address; a file's name on the hub may hold ``?`` and ``#``."""
+    try:
+        parts = urlsplit(address)
+    except ValueError:  # such as a bracket that is not closed
+        raise UserError(f"{address} is no address of a motion: {_FORM}") from None
+    if parts.scheme != "hf":
+        return parts
+    return parts._replace(path=address.removeprefix(f"hf://{parts.netloc}"), query="", fragment="")
+
+
 def _scheme(address: str) -> str:
     """Scheme of an address, "https" or "hf", once its form is known to be good and its packages to be there."""
-    parts = urlsplit(address)
+    parts = _split(address)
     if parts.scheme == "http" and parts.hostname not in OURS:
         raise UserError(f"{address} is not encrypted: {_FORM}")
     known = {"https": bool(parts.hostname), "http": True, "hf": _DATA_SET.fullmatch(address) is not None}

@@ -3,10 +3,11 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 
+from fmpjax import config as configuration
 from fmpjax import diagnose
 from fmpjax.config import Config
 from fmpjax.evaluate import Evaluation, table
-from fmpjax.logs import MetricsLog, clock
+from fmpjax.logs import MetricsLog, Mirror, clock
 from fmpjax.ppo import PPOState
 from fmpjax.runs.clock import Clock
 from fmpjax.runs.folder import Run
@@ -27,6 +28,7 @@ class Recorder:
         note: Callable[[str], None],
         label: str = "",
         keep: bool = True,
+        logger: str | None = None,
     ):
         """Continue the run's log from an iteration.
 
@@ -39,12 +41,16 @@ class Recorder:
           note: says a line.
           label: says which run it is, where there are several.
           keep: False where another process writes.
+          logger: "wandb" or "trackio" gets the rows of the log, too.
         """
         self._run, self._config, self._label, self._keep = run, config, label, keep
         self._evaluate, self._note = evaluate, note
-        self.log = MetricsLog(run.folder, list(columns), iteration, keep=keep)
+        mirror = Mirror(logger, run.folder, configuration.flatten(run.config)) if logger and keep else None
+        self.log = MetricsLog(run.folder, list(columns), iteration, keep=keep, mirror=mirror)
         rows = [row for row in self.log.rows if row.get("eval/quality")]
-        self.best = max((float(row["eval/quality"]) for row in rows), default=-1.0)  # quality of the best policy
+        # Rows of earlier versions have no score with a command: the next policy replaces theirs.
+        name = "eval/quality" if config.command.kind == "none" else "eval/score"
+        self.best = max((float(row[name]) for row in rows if row.get(name)), default=-1.0)  # score of the best policy
         self.evaluated = max((int(row["iteration"]) for row in rows), default=0)  # the last iteration evaluated
 
     def record(
@@ -65,9 +71,9 @@ class Recorder:
         evaluation, self.evaluated = self._evaluate(state.ppo), at.done
         self._note(f"evaluation at {at.transitions:,} transitions, {self._label}{clock(at.seconds)}:")
         self._note(table(evaluation))
-        better = evaluation.quality >= self.best
+        better = evaluation.score >= self.best
         if better:
-            self.best = evaluation.quality
+            self.best = evaluation.score
         figures = {f"eval/{name}": float(value) for name, value in evaluation.as_dict().items()}
         self._write(at, {**row, **figures}, state, better=better)
         course = diagnose.Course(self.log.rows, self._config, json.loads(evaluation.to_json()))

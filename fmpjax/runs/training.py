@@ -9,7 +9,7 @@ import numpy as np
 
 from fmpjax import evaluate, memory, sharding
 from fmpjax.errors import UserError, out_of_memory
-from fmpjax.logs import Progress, clock
+from fmpjax.logs import Progress, check_logger, clock
 from fmpjax.motion import library
 from fmpjax.provenance import machine
 from fmpjax.runs.clock import Clock, End
@@ -30,21 +30,27 @@ def train(
     minutes: float | None = None,
     devices: int | None = 1,
     live: Live | None = None,
+    logger: str | None = None,
 ) -> End:
     """Train a run to the end of its budget, or of its time, or until it is told to stop; all three end cleanly.
 
     Several runs that differ in nothing but their seeds are trained at once, as one program, each into its own folder.
     Several devices, all of them for None, share the environments or the seeds. ``live`` shows the policies meanwhile.
+    ``logger``, "wandb" or "trackio", gets the rows of the log.
 
     Raises:
-      UserError: the runs do not belong together, too much was not finite, or memory is too small; what was saved stays.
+      UserError: the runs do not belong together, too much was not finite, memory is too small, or the logger is unknown
+        or not installed; what was saved stays.
     """
+    check_logger(logger)
     memory.check(group[0].config, len(group))
     with enough_memory(group), held(group):
-        return _train(*group, resume=resume, minutes=minutes, devices=devices, live=live)
+        return _train(*group, resume=resume, minutes=minutes, devices=devices, live=live, logger=logger)
 
 
-def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None, live: Live | None) -> End:
+def _train(
+    *group: Run, resume: bool, minutes: float | None, devices: int | None, live: Live | None, logger: str | None
+) -> End:
     progress = Progress(show=sharding.primary())
     config, began = group[0].config, time.monotonic()
     progress.note(
@@ -62,7 +68,7 @@ def _train(*group: Run, resume: bool, minutes: float | None, devices: int | None
         live.open(session)
     session.pretrain(progress)
     compiling = _compile(session, devices, progress)
-    recorders = _recorders(session, progress)
+    recorders = _recorders(session, progress, logger)
     training = Clock(
         config,
         done=session.done,
@@ -121,7 +127,7 @@ def _compile(session: Session, devices: int | None, progress: Progress) -> float
     return compiling
 
 
-def _recorders(session: Session, progress: Progress) -> list[Recorder]:
+def _recorders(session: Session, progress: Progress, logger: str | None) -> list[Recorder]:
     """A recorder for each run, from where the session stands."""
     columns = [*session.metric_names(), *(f"eval/{name}" for name in evaluate.names(session.config))]
     several = len(session.group) > 1
@@ -135,6 +141,7 @@ def _recorders(session: Session, progress: Progress) -> list[Recorder]:
             note=progress.note,
             label=f"seed {run.config.seed}, " if several else "",
             keep=sharding.primary(),
+            logger=logger,
         )
         for run in session.group
     ]

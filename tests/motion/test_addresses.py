@@ -223,6 +223,7 @@ def test_a_pickle_from_the_network_runs_nothing(server, tmp_path):
     [
         ("ftp://host/a.npz", "ftp://host/a.npz is no address of a motion: expected https://HOST/FILE or hf://datasets"),
         ("https:///a.npz", "https:///a.npz is no address of a motion"),
+        ("https://[host/a.npz", r"https://\[host/a.npz is no address of a motion"),
         ("https://host/", "https://host/ names no file: expected https://HOST/FILE"),
         ("http://host/a.npz", "http://host/a.npz is not encrypted: expected https://HOST/FILE"),
         ("hf://someone/model/a.npz", "hf://someone/model/a.npz is no address of a motion"),
@@ -259,6 +260,7 @@ def test_who_sees_an_address():
     for name in ("https://h/a.npz?key=secret", "https://me:secret@h/a.npz", "/home/me/a.npz", "walk"):
         assert not addresses.shareable(name)
     assert addresses.file_name("https://h/in/a%2Fb.npz?key=secret") == "b.npz"
+    assert addresses.file_name(f"{SET}/in/a #2?.npz") == "a #2?.npz"
 
 
 # --- the hub ---------------------------------------------------------------------------------------------------------

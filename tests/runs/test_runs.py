@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from fmpjax.config import preset
-from fmpjax.evaluate import Evaluation
+from fmpjax.evaluate import Evaluation, names, table
 from fmpjax.logs import MetricsLog
 from fmpjax.runs.clock import SAVE_INTERVAL, Clock, Due, End
 from fmpjax.runs.recorder import Recorder
@@ -179,28 +179,29 @@ STATE = SimpleNamespace(name="state", ppo="policy")
 ROW = {"train/reward": 0.5}
 
 
-def evaluation(falls):
+def evaluation(falls, obedience=None):
     """Figures of ten episodes at the demonstration's own speed, of which some fell: the quality is 1 - falls / 10."""
-    names = [f.name for f in dataclasses.fields(Evaluation) if f.name not in ("starts", "motions")]
+    fields = [f.name for f in dataclasses.fields(Evaluation) if f.name not in ("obedience", "starts", "motions")]
     known = {"episodes": 10, "falls": falls, "late_speed": 0.8, "demonstration_speed": 0.8}
-    known |= {"joint_ranges": (0.0,) * 6, "expert_ranges": (0.0,) * 6}
-    return Evaluation(**dict.fromkeys(names, 0.0) | known)
+    known |= {"joint_ranges": (0.0,) * 6, "expert_ranges": (0.0,) * 6, "obedience": obedience}
+    return Evaluation(**dict.fromkeys(fields, 0.0) | known)
 
 
 @pytest.fixture
 def make(tmp_path):
     """A function that makes a recorder in the test's folder, whose policies fall as often as it is told."""
 
-    def recorder(*falls, iteration=0, **options):
+    def recorder(*falls, iteration=0, config=CONFIG, **options):
         results, said = iter(falls), []
         run = SimpleNamespace(folder=tmp_path, checkpoints=Checkpoints(tmp_path))
 
         def evaluate(policy):
             assert policy == "policy"
-            return evaluation(next(results))
+            found = next(results)
+            return evaluation(*found) if isinstance(found, tuple) else evaluation(found)
 
-        columns = ["train/reward", "eval/quality", "eval/falls"]
-        made = Recorder(run, CONFIG, columns, iteration, evaluate=evaluate, note=said.append, **options)
+        columns = ["train/reward", *(f"eval/{name}" for name in names(config))]
+        made = Recorder(run, config, columns, iteration, evaluate=evaluate, note=said.append, **options)
         return made, run.checkpoints.saved, said
 
     return recorder
@@ -241,6 +242,37 @@ def test_an_evaluation_is_said_and_written_and_the_best_policy_kept(make, at, tm
     headline, _, diagnosis = said[:3]
     assert headline == "evaluation at 256 transitions, seed 3, 1:16:"
     assert diagnosis.startswith("diagnosis at 256 transitions")
+
+
+COMMANDED = preset("smoke", **{"command.kind": "velocity", "transitions": 640, "env.count": 8, "ppo.rollout_steps": 8})
+
+
+def test_the_best_policy_of_a_steered_run_obeys(make, at, tmp_path):
+    """Qualities of 1, 0.9 and 1: the second is the best, since it obeys. A resumed run knows; older rows do not say."""
+    recorder, saved, said = make((0, 0.2), (1, 0.8), (0, 0.6), config=COMMANDED)
+    for iteration in (4, 6, 8):
+        at.tick(iteration, 1.0)
+        recorder.record(at, ROW, STATE, evaluate=True)
+    recorder.close()
+    assert [rows for kind, _, rows in saved if kind == "best"] == [1, 2]
+    assert recorder.best == pytest.approx(0.72) and "obedience" in said[1]
+    rows = MetricsLog.read(tmp_path / "metrics.csv")
+    assert [row["eval/obedience"] for row in rows] == ["0.2", "0.8", "0.6"]
+    assert [row["eval/score"] for row in rows] == ["0.2", "0.72", "0.6"]
+    again, *_ = make(iteration=8, config=COMMANDED)
+    assert again.best == pytest.approx(0.72)
+    rows = (tmp_path / "metrics.csv").read_text()
+    (tmp_path / "metrics.csv").write_text(rows.replace("eval/score", "eval/earlier"))
+    older, *_ = make(iteration=8, config=COMMANDED)
+    assert older.best == -1.0
+
+
+def test_without_a_command_the_figures_are_those_they_were():
+    assert not {"obedience", "score"} & {*names(CONFIG), *evaluation(3).as_dict(), *evaluation(3).record()}
+    for figures in (names(COMMANDED), evaluation(3, 0.5).as_dict(), evaluation(3, 0.5).record()):
+        assert {"obedience", "score"} <= {*figures}
+    assert evaluation(3).score == evaluation(3).quality and evaluation(3, 0.5).score == pytest.approx(0.35)
+    assert "obedience" not in table(evaluation(3))
 
 
 def test_a_resumed_recorder_knows_what_was_best(make, at):
