@@ -39,7 +39,7 @@ def train(
     Raises:
       UserError: the runs do not belong together, too much was not finite, or memory is too small; what was saved stays.
     """
-    memory.check(group[0].config, len(group))
+    memory.check(group[0].config, len(group), len(group[0].trainer().expert.windows))
     with enough_memory(group), held(group):
         return _train(*group, resume=resume, minutes=minutes, devices=devices, live=live)
 
