@@ -31,7 +31,7 @@ MOST_WINDOWS = 1 << 16
 # Fields of `EnvState` with a leading axis of environments.
 PER_ENVIRONMENT = ("physics", "observed", "history", "age", "command", "disturbed")
 
-__all__ = ["ActionMap", "Drawn", "Env", "EnvState", "Moment", "Steps", "action_map"]
+__all__ = ["ActionMap", "Drawn", "Env", "EnvState", "Moment", "Steps", "action_map", "window_count"]
 
 
 class EnvState(NamedTuple):
@@ -99,6 +99,18 @@ class Steps(NamedTuple):
     wanted: Any = ()  # [T, N] int32 indices into the frame table, where the command names the frame to reach
 
 
+def window_count(library: MotionLibrary, config: Config) -> int:
+    """W, the windows of `Env.clip_windows`, before there are any."""
+    parts = config.env.demonstration_parts
+    lengths = (library.lengths - 1) * parts + 1 - _rows_before(config)
+    return int((-(-lengths // max(1, -(-lengths.sum() // MOST_WINDOWS)))).sum())
+
+
+def _rows_before(config: Config) -> int:
+    """Rows of its clip that a row needs ahead of it to end a window."""
+    return 0 if config.env.early_frames else (config.features.history - 1) * config.env.demonstration_parts
+
+
 class Env:
     """Environments of one robot and its demonstrations; its methods are pure."""
 
@@ -116,7 +128,7 @@ class Env:
             library, clips=tuple(refined(clip, self.stride) for clip in library.clips)
         )
         # The first row of a clip at which an episode may begin: a window needs rows ahead of it.
-        self.first_row = 0 if config.env.early_frames else (self.horizon - 1) * self.stride
+        self.first_row = _rows_before(config)
         # Rows 0..M-1 are the demonstrations, row M the default pose; resets gather from here.
         self._qpos = np.concatenate([library.qpos, robot.default_qpos[None]]).astype(np.float32)
         self._qvel = np.concatenate([library.qvel, np.zeros_like(library.qvel[:1])]).astype(np.float32)

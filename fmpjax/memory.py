@@ -6,20 +6,28 @@ On an accelerator nothing is estimated: its allocator refuses with an error, of 
 import jax
 
 from fmpjax import features, machine, robots
-from fmpjax.config import SMP_NETWORKS, AdversaryConfig, Config
+from fmpjax.config import FOLLOWERS, SMP_NETWORKS, AdversaryConfig, Config
 from fmpjax.errors import UserError
 
 
-def parts(config: Config, seeds: int = 1) -> dict[str, int]:
+def parts(config: Config, seeds: int = 1, windows: int = 0) -> dict[str, int]:
     """The least bytes that a training program needs, by the setting that they grow with.
 
+    Args:
+      config: of the run.
+      seeds: runs at once.
+      windows: of the demonstrations, from which the prior learns; 0 where they are not known, and not counted.
+
     Only large arrays that exist at the same time are counted. The compiled programs that were measured (in
-    ``tests/test_memory.py``) take 1.2 to 2.7 times the sum.
+    ``tests/test_memory.py``) take 1.1 to 2.7 times the sum.
     """
     prior = config.prior
     window = 4 * config.features.history * len(features.compact_weights(robots.load(config.robot)))  # float32
-    # A rollout's windows, and once more on their way through the prior.
-    needed = {"env.count": 2 * config.transitions_per_iteration * window}
+    copies = 2  # a rollout's windows, and once more on their way through the prior
+    if config.method in FOLLOWERS:
+        # Single frames, those that were wanted, their differences, and once more in another order.
+        window, copies = window // config.features.history, 4
+    needed = {"env.count": copies * config.transitions_per_iteration * window}
     section = getattr(config, config.method, None)
     if isinstance(section, AdversaryConfig):
         kinds = 3 if section.replay else 2
@@ -33,6 +41,11 @@ def parts(config: Config, seeds: int = 1) -> dict[str, int]:
         needed["smp.score_batch"] = min(config.smp.score_batch, config.transitions_per_iteration) * 8 * layer
         needed["smp.batch"] = config.smp.batch * 36 * layers * layer
         del needed[min(("smp.score_batch", "smp.batch"), key=needed.__getitem__)]  # one after the other
+    elif config.method == "pwil":
+        # What each window of the demonstration holds for each environment before the rollout; and within it, when the
+        # rollout's windows are there once.
+        masses, rollout = 4 * config.env.count * windows, needed["env.count"] // 2
+        needed["env.count"] = masses + max(2 * rollout, rollout + masses)
     elif section is None:  # a transport
         needed["prior.bank"] = 2 * 4 * prior.bank**2  # costs to another bank and to itself
     if config.method in ("fmp", "endpoint", "value"):
@@ -41,14 +54,15 @@ def parts(config: Config, seeds: int = 1) -> dict[str, int]:
     return {setting: seeds * size for setting, size in needed.items()}
 
 
-def check(config: Config, seeds: int = 1) -> None:
+def check(config: Config, seeds: int = 1, windows: int = 0) -> None:
     """Raise a `UserError` where a run, or one of so many seeds at once, cannot fit this machine's memory.
 
-    What is let through may still not fit: the estimate is a lower bound. Processes that train together share the work.
+    The arguments are those of `parts`. What is let through may still not fit: the estimate is a lower bound. Processes
+    that train together share the work.
     """
     if jax.default_backend() != "cpu":
         return
-    needed = {setting: size // jax.process_count() for setting, size in parts(config, seeds).items()}
+    needed = {setting: size // jax.process_count() for setting, size in parts(config, seeds, windows).items()}
     has = machine.memory()
     if has is None or sum(needed.values()) <= has:
         return

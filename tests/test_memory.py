@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import pytest
 
-from fmpjax import cli, machine, memory, motion, runs
+from fmpjax import cli, env, machine, memory, motion, runs
 from fmpjax.config import preset
 from fmpjax.errors import UserError
 from fmpjax.trainer import Trainer
@@ -32,7 +32,24 @@ MEASURED = {
     ("smoke", "method=smp", "env.count=512"): 731.8,
     ("smoke", "method=smp", "smp.batch=8192"): 1295.9,
     ("laptop", "method=smp"): 198.3,
+    ("smoke", "method=add", "env.count=512"): 74.1,
+    ("smoke", "method=tracking", "env.count=512"): 64.0,
 }
+
+
+COUNTS = (20_000, 65_536)  # windows of a demonstration, fewer and more than those of a rollout of `paper` hold
+# With PWIL what it takes grows with the demonstration's windows, whose number stands first; the walk in finer parts.
+MEASURED_WINDOWS = {
+    (23_617, "smoke", "method=pwil", "env.count=512"): 231.8,
+    (34_133, "smoke", "method=pwil", "env.count=128"): 79.9,
+}
+
+
+@pytest.mark.parametrize("case", MEASURED_WINDOWS, ids=str)
+def test_estimate_with_windows_is_below_what_was_measured(case):
+    windows, name, *settings = case
+    estimate = sum(memory.parts(preset(name, **dict(item.split("=") for item in settings)), 1, windows).values())
+    assert 1.1 < 1e6 * MEASURED_WINDOWS[case] / estimate < 2.75
 
 
 @pytest.mark.parametrize("case", MEASURED, ids=" ".join)
@@ -40,6 +57,38 @@ def test_estimate_is_below_what_was_measured(case):
     name, *settings = case
     estimate = sum(memory.parts(preset(name, **dict(item.split("=") for item in settings))).values())
     assert 1.15 < 1e6 * MEASURED[case] / estimate < 2.75
+
+
+def test_the_windows_of_the_demonstration_are_counted_for_pwil():
+    """What each window holds for each environment, 4 bytes: once, and twice where the rollout's own are fewer."""
+    config = preset("paper", method="pwil")
+    few, many = (memory.parts(config, 2, count)["env.count"] - memory.parts(config, 2)["env.count"] for count in COUNTS)
+    assert few == 2 * 4 * 1024 * COUNTS[0]
+    assert many == 2 * (2 * 4 * 1024 * COUNTS[1] - memory.parts(config)["env.count"] // 2)
+    assert memory.parts(preset("paper"), 1, 65_536) == memory.parts(preset("paper"))
+
+
+@pytest.mark.parametrize(("parts", "early"), [(1, False), (8, True), (8, False)])
+def test_windows_are_counted_before_there_are_any(robot, walk, monkeypatch, parts, early):
+    """Of two clips of different lengths; also where they are too many, and a part stands for all."""
+    turn = motion.load("turn_left")
+    library = motion.MotionLibrary(
+        (walk, dataclasses.replace(turn, qpos=turn.qpos[:99], qvel=turn.qvel[:99])), (0.5, 0.5)
+    )
+    config = preset("smoke", **{"env.demonstration_parts": parts, "env.early_frames": early})
+    for most in (1 << 16, 150):
+        monkeypatch.setattr(env, "MOST_WINDOWS", most)
+        made = env.Env(robot, library, config, None)
+        assert env.window_count(library, config) == len(made.window_share())
+
+
+def test_a_long_motion_that_pwil_cannot_hold_is_refused(monkeypatch):
+    """The walk itself fits, its windows for so many environments do not."""
+    config = preset("smoke", method="pwil", **{"env.count": 512})
+    monkeypatch.setattr(machine, "memory", lambda: sum(memory.parts(config).values()) + 1000)
+    memory.check(config)
+    with pytest.raises(UserError, match=r"expected a smaller env.count \(now 512\)"):
+        runs.check_trainable(config)
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from fmpjax import jsons, memory, motion, priors, robots
 from fmpjax.checkpoint import Checkpoints
 from fmpjax.commands import velocity
 from fmpjax.config import Config
+from fmpjax.env import window_count
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Evaluation, Evaluator
 from fmpjax.files import write
@@ -35,11 +36,12 @@ def check_trainable(config: Config, seeds: int = 1) -> None:
     """Ask before there is a folder, which the corrected call would find taken, whether runs can be trained here.
 
     Raises:
-      UserError: the method or the robot is unknown, or ``seeds`` runs at once do not fit the memory.
+      UserError: the method, the robot or a motion is unknown, or ``seeds`` runs at once do not fit the memory.
     """
     priors.check(config.method)
     robots.load(config.robot)
-    memory.check(config, seeds)
+    memory.check(config, seeds)  # before the motions are read, which may be large
+    memory.check(config, seeds, window_count(load_motion(config), config))
 
 
 def load_motion(config: Config) -> motion.MotionLibrary:

@@ -43,7 +43,7 @@ def train(
         or not installed; what was saved stays.
     """
     check_logger(logger)
-    memory.check(group[0].config, len(group))
+    memory.check(group[0].config, len(group), len(group[0].trainer().expert.windows))
     with enough_memory(group), held(group):
         return _train(*group, resume=resume, minutes=minutes, devices=devices, live=live, logger=logger)
 
