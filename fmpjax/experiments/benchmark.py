@@ -168,7 +168,7 @@ def notes(record: Mapping[str, Any]) -> list[str]:
     """What the reader of the table must know of its figures."""
     count, planned = record["cells"]["finished"], record["cells"]["planned"]
     found = [
-        f"{count} of {planned} cells are finished." if count < planned else f"All {planned} cells are finished.",
+        f"{count} of {planned} cells are finished.",
         "Methods are compared on the motions and seeds that all of them have finished.",
         "Figures are interquartile means over motions and seeds (of walks the share), with their 95 % bootstrap "
         "intervals, stratified by motion; the last column counts pairs of the same motion and seed.",

@@ -152,9 +152,10 @@ def draw(record: Mapping[str, Any], results: Sequence[Result], paths: Sequence[P
             panel.set_title(f"{reset} reset, {_EQUAL[budget]}", fontsize=9, loc="left")
             panel.set_xlabel("quality of at least", fontsize=8)
         for method, cells in groups(results)[reset, "transitions"].items():
-            walked = np.sort([r.walk_transitions for r in cells.values()]) / 1e6
-            steps = np.arange(1, len(walked) + 1) / len(walked)
-            panels[2].step([0.0, *walked], [0.0, *steps], where="post", color=colors[method], linewidth=1.5)
+            walked = sorted(r.walk_transitions for r in cells.values() if math.isfinite(r.walk_transitions))
+            times = np.array([0, *walked, max(r.transitions for r in cells.values())]) / 1e6
+            shares = np.array([*range(len(walked) + 1), len(walked)]) / len(cells)
+            panels[2].step(times, shares, where="post", color=colors[method], linewidth=1.5)
         panels[2].set_title(f"{reset} reset, cells that have walked", fontsize=9, loc="left")
         panels[2].set_xlabel("million transitions", fontsize=8)
         for panel in panels:
