@@ -17,6 +17,7 @@ from fmpjax.trainer import Trainer
 
 SPEEDS, TURNS = 7, 9  # cells of the grid ahead and turning
 SIDES = 5  # cells to the sides, where any are commanded
+ASIDE = 0.1  # m/s, extent to the sides below which none are: a walk drifts by some hundredths
 CONSTANT = 10.0  # s, of an episode under one command
 SETTLING = 2.0  # s at its start that do not count
 LEG, LEGS = 3.0, 7  # s under each of an episode's changing commands, and their number
@@ -123,8 +124,10 @@ def _grid(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     speeds, turns = np.linspace(low[0], high[0], SPEEDS), np.linspace(low[2], high[2], TURNS)
     for values in (speeds, turns):
         values[np.abs(values).argmin()] = 0.0  # standing and straight ahead are among them: zero is within the extent
-    sides = [side for side in np.linspace(low[1], high[1], SIDES) if abs(side) > 1e-6] if low[1] < high[1] else []
-    return np.array([(v, 0.0, w) for v in speeds for w in turns] + [(0.0, side, 0.0) for side in sides])
+    sides = np.linspace(low[1], high[1], SIDES) if high[1] - low[1] > ASIDE else np.array([])
+    return np.array(
+        [(v, 0.0, w) for v in speeds for w in turns] + [(0.0, side, 0.0) for side in sides if abs(side) > 1e-6]
+    )
 
 
 def beyond(trainer: Trainer) -> str | None:

@@ -4,6 +4,7 @@
 leaves out the checks of the shapes that functions state.
 """
 
+import gc
 import os
 import tempfile
 from pathlib import Path
@@ -38,6 +39,10 @@ if os.environ.get("FMPJAX_TEST_SHAPES") != "0":
     jaxtyping.install_import_hook(CHECKED, "tests.shapes.checked")
 
 from fmpjax import motion, robots  # noqa: E402
+
+# What is imported stays, and tracing makes many small objects: collecting them as often as usual takes a twentieth.
+gc.freeze()
+gc.set_threshold(50_000, 20, 50)
 
 
 @pytest.fixture(scope="session")

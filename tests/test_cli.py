@@ -109,7 +109,9 @@ def test_unknown_preset(refused, command):
 
 
 def test_unknown_experiment(refused):
-    assert "unknown experiment 'nope': expected one of ablate, barycenter, curvature" in refused("experiment", "nope")
+    assert "unknown experiment 'nope': expected one of ablate, barycenter, benchmark, curvature" in refused(
+        "experiment", "nope"
+    )
 
 
 # --- motion files ----------------------------------------------------------------------------------------------------

@@ -40,9 +40,9 @@ def test_no_call_is_of_one_system_alone(tmp_path):
         _BARE
         + f"""
 from fmpjax import config, machine, physics, robots, runs
-from fmpjax.experiments.common import cells
+from fmpjax.experiments.common import engines
 print(machine.cores(), physics.make(robots.load("strider"), config.preset("smoke").physics).threads)
-print(runs.provenance()["cores"], runs.machine(), cells._shares(2))
+print(runs.provenance()["cores"], runs.machine(), engines.shares(2))
 folder = runs.Run({str(tmp_path)!r})
 with runs.training.held([folder]):
     print("held")
