@@ -73,8 +73,7 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
         return Velocity(table[rows], drawn.left, jnp.zeros_like(drawn.value))
 
     def advance(state, drawn, frame):
-        # After a large change of the command, only a leap would bring the mean of the whole error back to zero.
-        error = jnp.clip(heading_velocity(frame, layout) - state.value, -config.error_limit, config.error_limit)
+        error = compressed(heading_velocity(frame, layout) - state.value, config.error_scale)
         off = state.off + newest * (error - state.off)
         held = state._replace(off=off)
         never = jnp.zeros(state.left.shape, bool)
@@ -91,6 +90,15 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
         return (1.0 - config.turn_share) * linear + config.turn_share * turning
 
     return Command(3, draw, begin, advance, lambda state: state.value, lambda state: state.off)
+
+
+def compressed(error: jax.Array, scale: float) -> jax.Array:
+    """Errors as they count in the running mean: small ones as they are, large ones by their logarithm.
+
+    After a large change of the command only a leap would bring the mean of the whole error back to zero. Where errors
+    were cut off, none of the steps toward a velocity that is far off would earn more than the one before.
+    """
+    return jnp.sign(error) * scale * jnp.log1p(jnp.abs(error) / scale)
 
 
 def extent(config: CommandConfig, library: MotionLibrary) -> np.ndarray:

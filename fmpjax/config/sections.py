@@ -105,7 +105,8 @@ class CommandConfig(Section):
     sideways: tuple[float, ...] = ()  # m/s, the same to the left; empty for none where another range is given [D]
     turn: tuple[float, ...] = ()  # rad/s, the same of turning to the left [D]
     average: PositiveFloat = 0.5  # s, time constant of the running means of errors and distances [D: half a stride]
-    error_limit: PositiveFloat = 0.3  # m/s and rad/s, as much of an error counts in that mean [D: none asks for a leap]
+    # m/s and rad/s; in that mean a larger error counts by its logarithm [D: the whole error asks for a leap]
+    error_scale: PositiveFloat = 0.3
     speed_width: PositiveFloat = 0.2  # m/s, error at which the reward of the speed falls to a half [D]
     turn_width: PositiveFloat = 0.25  # rad/s, error at which the reward of the turning falls to a half [D]
     turn_share: Fraction = 0.5  # of the turning in the reward [D]

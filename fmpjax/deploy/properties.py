@@ -41,7 +41,7 @@ def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
         "command_ranges": _list(f"{low};{high}" for low, high in (origin.commands or {}).values()),
         # s, and m/s and rad/s: time constant of the running means in velocity_errors, and what counts of an error
         "command_average": str(origin.config.command.average),
-        "command_error_limit": str(origin.config.command.error_limit),
+        "command_error_scale": str(origin.config.command.error_scale),
         "action_offset": _list(policy.center),
         "action_clip": _pairs(policy.low, policy.high),
         "joint_effort": _list(robot.effort),

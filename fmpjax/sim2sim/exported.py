@@ -37,7 +37,7 @@ class Policy(NamedTuple):
     facts: dict[str, np.ndarray]  # what `facts` says of the model of the training
     robot: str
     average: float = 0.5  # s, time constant of the running means of the velocity's errors
-    error_limit: float = 0.3  # m/s and rad/s, as much of an error counts in them
+    error_scale: float = 0.3  # m/s and rad/s; a larger error counts in them by its logarithm
     commands: np.ndarray | None = None  # [2, 3] lowest and highest velocity that it may be told (m/s, m/s, rad/s)
 
 
@@ -115,7 +115,7 @@ def read(
             facts={name: _rows(said[name]) for name in FACTS},
             robot=said["robot"],
             average=float(said.get("command_average", 0.5)),
-            error_limit=float(said.get("command_error_limit", 0.3)),
+            error_scale=float(said.get("command_error_scale", 0.3)),
             commands=_rows(said["command_ranges"]).T if said.get("command_ranges") else None,
         )
     except KeyError as error:

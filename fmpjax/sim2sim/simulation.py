@@ -168,8 +168,10 @@ class Simulation:
             return True
         mujoco.mj_kinematics(self.model, self.data)
         if "velocity_errors" in self.policy.terms:
-            newest, most = min(1.0, self.policy.step_dt / self.policy.average), self.policy.error_limit
-            self.errors = self.errors + newest * (np.clip(self.velocity() - self.command, -most, most) - self.errors)
+            newest, scale = min(1.0, self.policy.step_dt / self.policy.average), self.policy.error_scale
+            off = self.velocity() - self.command
+            counted = np.sign(off) * scale * np.log1p(np.abs(off) / scale)
+            self.errors = self.errors + newest * (counted - self.errors)
         return any((self._point(body, ends)[:, 2] < radius).any() for body, ends, radius in self._falls)
 
     def velocity(self) -> np.ndarray:

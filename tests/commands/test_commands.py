@@ -135,15 +135,17 @@ def test_the_reward_of_a_velocity_in_closed_form(robot, slow_and_left):
     frame[:, layout.velocity], frame[:, layout.angular_velocity] = [-0.3, 1.0, 5.0], [7.0, 7.0, 0.2]
     state = velocity.Velocity(jnp.array([[0.8, 0.3, 0.0]]), jnp.array([1]), jnp.zeros((1, 3)))
     # Errors of 0.2 m/s and 0.2 rad/s, of which the first of five steps counts a fifth and all that follow the rest.
+    counted = 0.3 * np.log(1 + 0.2 / 0.3)
     for share in (0.2, 0.36):
         state, _, reward = command.advance(state, None, jnp.asarray(frame))
-        expected = 0.7 / (1 + (0.2 * share) ** 2 / 0.25) + 0.3 / (1 + (0.2 * share) ** 2 / 0.16)
+        expected = 0.7 / (1 + (counted * share) ** 2 / 0.25) + 0.3 / (1 + (counted * share) ** 2 / 0.16)
         np.testing.assert_allclose(reward, [expected], rtol=1e-5)
-    np.testing.assert_allclose(state.off, [[0.072, 0.0, 0.072]], atol=1e-6)
-    # Of a large error 0.3 counts, whatever its sign.
+    np.testing.assert_allclose(state.off, [[0.36 * counted, 0.0, 0.36 * counted]], atol=1e-6)
+    # A large error counts by its logarithm, whatever its sign: 4.0 m/s and 4.2 rad/s here.
     far = velocity.Velocity(jnp.array([[5.0, 0.3, -4.0]]), jnp.array([1]), jnp.zeros((1, 3)))
     off = command.advance(far, None, jnp.asarray(frame)).state.off
-    np.testing.assert_allclose(off, [[-0.06, 0.0, 0.06]], atol=1e-6)
+    large = 0.2 * 0.3 * np.log(1 + np.array([4.0, 4.2]) / 0.3)
+    np.testing.assert_allclose(off, [[-large[0], 0.0, large[1]]], rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(command.reveal(state), state.off)
 
 

@@ -47,7 +47,7 @@ def test_copies_are_what_they_say(trainer):
 
 @pytest.mark.slow
 def test_demonstration_beats_frozen_and_slowed_copies_when_the_pool_stands(trainer):
-    result = ranking.rank(trainer, standing_pool(trainer), jax.random.PRNGKey(0), updates=256)
+    result = ranking.rank(trainer, standing_pool(trainer), jax.random.PRNGKey(0), updates=128)
     print(ranking.table(result))
     good = result["demonstration"]
     for name in ("frozen", "slowed to half"):

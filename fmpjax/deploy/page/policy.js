@@ -34,7 +34,7 @@ export async function load(bytes, wasm) {
     // Lowest and highest command forward and to the left (m/s) and of the turn (rad/s); null without commands.
     ranges: said.command_ranges ? rows(said.command_ranges) : null,
     average: Number(said.command_average ?? 0.5), // s, time constant of the running means of the velocity's errors
-    errorLimit: Number(said.command_error_limit ?? 0.3), // m/s and rad/s, as much of an error counts in them
+    errorScale: Number(said.command_error_scale ?? 0.3), // m/s and rad/s; a larger error counts by its logarithm
     history: Math.max(1, ...numbers(said.observation_terms_history_length)), // steps that each term is of
     said,
   };

@@ -132,7 +132,10 @@ export class Simulation {
     this.#read();
     const newest = Math.min(1, policy.stepTime / policy.average);
     const velocity = this.velocity();
-    const counted = (i) => Math.max(-policy.errorLimit, Math.min(policy.errorLimit, velocity[i] - this.command[i]));
+    const counted = (i) => {
+      const off = velocity[i] - this.command[i];
+      return Math.sign(off) * policy.errorScale * Math.log1p(Math.abs(off) / policy.errorScale);
+    };
     this.errors = this.errors.map((error, i) => error + newest * (counted(i) - error));
     const [places, axes] = [data.xpos, data.xmat];
     this.fallen ||= this.shapes.some(({ body, ends, radius }) =>
