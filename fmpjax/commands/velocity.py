@@ -87,7 +87,7 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
         # Unlike a Gaussian's, the slope does not vanish for errors many widths large.
         linear = 1.0 / (1.0 + (off[..., :2] ** 2).sum(-1) / config.speed_width**2)
         turning = 1.0 / (1.0 + (off[..., 2] / config.turn_width) ** 2)
-        return (1.0 - config.turn_share) * linear + config.turn_share * turning
+        return linear * turning  # in a sum, a robot that stands would earn most of what turning on the spot does
 
     return Command(3, draw, begin, advance, lambda state: state.value, lambda state: state.off)
 

@@ -109,7 +109,6 @@ class CommandConfig(Section):
     error_scale: PositiveFloat = 0.3
     speed_width: PositiveFloat = 0.2  # m/s, error at which the reward of the speed falls to a half [D]
     turn_width: PositiveFloat = 0.25  # rad/s, error at which the reward of the turning falls to a half [D]
-    turn_share: Fraction = 0.5  # of the turning in the reward [D]
 
     @property
     def ranges(self) -> tuple[tuple[float, ...], ...] | None:

@@ -128,7 +128,7 @@ def test_a_command_is_held_and_then_another(robot, slow_and_left):
 
 
 def test_the_reward_of_a_velocity_in_closed_form(robot, slow_and_left):
-    settings = CommandConfig(kind="velocity", speed_width=0.5, turn_width=0.4, turn_share=0.3, average=0.1)
+    settings = CommandConfig(kind="velocity", speed_width=0.5, turn_width=0.4, average=0.1)
     command, layout = velocity.make(settings, RATE, robot, slow_and_left), FrameLayout.of(robot)
     frame = np.zeros((1, layout.size), np.float32)
     frame[:, layout.rotation] = [0, 1, 0, 0, 0, 1]  # faces +y
@@ -138,7 +138,7 @@ def test_the_reward_of_a_velocity_in_closed_form(robot, slow_and_left):
     counted = 0.3 * np.log(1 + 0.2 / 0.3)
     for share in (0.2, 0.36):
         state, _, reward = command.advance(state, None, jnp.asarray(frame))
-        expected = 0.7 / (1 + (counted * share) ** 2 / 0.25) + 0.3 / (1 + (counted * share) ** 2 / 0.16)
+        expected = 1 / (1 + (counted * share) ** 2 / 0.25) / (1 + (counted * share) ** 2 / 0.16)
         np.testing.assert_allclose(reward, [expected], rtol=1e-5)
     np.testing.assert_allclose(state.off, [[0.36 * counted, 0.0, 0.36 * counted]], atol=1e-6)
     # A large error counts by its logarithm, whatever its sign: 4.0 m/s and 4.2 rad/s here.
