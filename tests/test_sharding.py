@@ -1,6 +1,7 @@
 """Several devices and several processes: the numbers of one, to rounding. The devices are four fake ones of the CPU."""
 
 import csv
+import os
 import socket
 import subprocess
 import sys
@@ -160,7 +161,9 @@ def test_two_processes_are_one(tmp_path):
 
     def start(*arguments):
         command = [sys.executable, "-c", flags + main, *map(str, [*common, *arguments])]
-        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        # Without kept programs: two processes of which one compiles and the other reads what was kept were seen to hang.
+        alone = os.environ | {"JAX_COMPILATION_CACHE_DIR": ""}
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=alone)
 
     pair = [start(*joined, "--process", i) for i in range(2)]
     said = [process.communicate(timeout=300)[0] for process in pair]
