@@ -161,7 +161,7 @@ def test_two_processes_are_one(tmp_path):
 
     def start(*arguments):
         command = [sys.executable, "-c", flags + main, *map(str, [*common, *arguments])]
-        # Without kept programs: two processes of which one compiles and the other reads what was kept were seen to hang.
+        # Without kept programs: two processes of which one compiles and the other reads were seen to hang.
         alone = os.environ | {"JAX_COMPILATION_CACHE_DIR": ""}
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=alone)
 
