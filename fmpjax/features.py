@@ -307,6 +307,11 @@ def turned_windows(windows: Float[jax.Array, "*batch H F"], planar: _Planar) -> 
     return jnp.where(planar.sign == 0, windows, turned)
 
 
+def in_own_heading(robot: Robot, frames: Float[jax.Array, "*batch F"]) -> Float[jax.Array, "*batch F"]:
+    """Compact frames ``[..., F]`` in axes of which x points where each frame's root does."""
+    return turned_windows(frames[..., None, :], _planar(robot))[..., 0, :]
+
+
 def relative_windows(frames: Float[jax.Array, "*batch H F"]) -> Float[jax.Array, "*batch H F"]:
     """Windows ``[..., H, F]`` of compact frames with x and y made relative to the newest frame."""
     return frames.at[..., PLANAR].add(-frames[..., -1:, PLANAR])

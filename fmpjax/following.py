@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import frozen, jsons, metrics, tables
+from fmpjax import features, frozen, jsons, metrics, tables
 from fmpjax.errors import UserError
 from fmpjax.frames import FrameLayout
 from fmpjax.ppo import PPOState
@@ -70,10 +70,8 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 128) -> Follow
     latest = max(env.first_row, last - round(LEAST * rate) * env.stride)
     rows = np.linspace(env.first_row, latest, episodes).round().astype(np.int32)
     steps = math.ceil((last - rows.min()) / env.stride)
-    qpos, points, counts, fell = map(np.asarray, _play(trainer, state, jnp.asarray(rows), steps))
-    reached = np.minimum(rows + env.stride * (1 + np.arange(steps)[:, None]), last)
-    frames = np.asarray(env.clip_frames)
-    wanted_points = np.asarray(_points(trainer, jnp.asarray(frames)))[reached]
+    qpos, points, reached, counts, fell = map(np.asarray, _play(trainer, state, jnp.asarray(rows), steps))
+    wanted_points = np.asarray(_points(trainer, env.clip_frames))[reached]
     played = Played(qpos, env.library.qpos[reached], points, wanted_points, reached / last, counts, fell)
     return figures(played, rows / last, trainer.robot.sagittal_joints, rate, last / env.stride / rate)
 
@@ -87,27 +85,19 @@ def _play(trainer: Trainer, state: PPOState, rows: jax.Array, steps: int):
         now, alive, fell = carry
         taken = frozen.step(trainer, env, policy, now, alive, drawn)
         reached = taken.now
-        return (reached, taken.alive, fell | taken.fell), (
-            reached.physics.qpos,
-            _points(trainer, reached.observed.frame),
-            alive,
-        )
+        record = reached.physics.qpos, _points(trainer, reached.observed.frame), reached.command, alive
+        return (reached, taken.alive, fell | taken.fell), record
 
     drawn = env.disturbance_draws(jax.random.PRNGKey(0), steps, len(rows))
     alive = jnp.ones(len(rows), bool)
-    (_, _, fell), (qpos, points, counts) = jax.lax.scan(step, (start, alive, ~alive), drawn, length=steps)
-    return qpos, points, counts, fell
+    (_, _, fell), played = jax.lax.scan(step, (start, alive, ~alive), drawn, length=steps)
+    return *played, fell
 
 
 def _points(trainer: Trainer, frame: jax.Array) -> jax.Array:
     """Key points less the root of frames ``[..., F]``, in their own heading: ``[..., K, 3]`` m."""
-    layout = FrameLayout.of(trainer.robot)
-    forward = frame[..., layout.rotation][..., :2]
-    x, y = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
-    points = frame[..., layout.key_points]
-    points = points.reshape(*points.shape[:-1], -1, 3)
-    ahead = points[..., 0] * x + points[..., 1] * y
-    return jnp.stack([ahead, points[..., 1] * x - points[..., 0] * y, points[..., 2]], axis=-1)
+    points = features.in_own_heading(trainer.robot, frame)[..., FrameLayout.of(trainer.robot).key_points]
+    return points.reshape(*points.shape[:-1], -1, 3)
 
 
 def figures(played: Played, begun: np.ndarray, joints: np.ndarray, rate: float, seconds: float) -> Following:

@@ -60,6 +60,8 @@ def connect(coordinator: str | None, processes: int | None, process: int | None)
             f"cannot join a distributed run ({str(error).splitlines()[0]}): expected to be started by SLURM or "
             "another scheduler that JAX knows, or --coordinator HOST:PORT, --processes and --process"
         ) from None
+    # Processes that read kept programs were seen to wait for each other for good: each compiles for itself.
+    jax.config.update("jax_enable_compilation_cache", False)
 
 
 def primary() -> bool:

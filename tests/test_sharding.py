@@ -1,7 +1,6 @@
 """Several devices and several processes: the numbers of one, to rounding. The devices are four fake ones of the CPU."""
 
 import csv
-import os
 import socket
 import subprocess
 import sys
@@ -161,9 +160,7 @@ def test_two_processes_are_one(tmp_path):
 
     def start(*arguments):
         command = [sys.executable, "-c", flags + main, *map(str, [*common, *arguments])]
-        # Without kept programs: two processes of which one compiles and the other reads were seen to hang.
-        alone = os.environ | {"JAX_COMPILATION_CACHE_DIR": ""}
-        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=alone)
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     pair = [start(*joined, "--process", i) for i in range(2)]
     said = [process.communicate(timeout=300)[0] for process in pair]

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from fmpjax.errors import UserError
+from fmpjax.viz.pictures import saved
 
 
 def draw(path: Path, seconds: float, curves: Mapping[str, Sequence[float]]) -> Path:
@@ -33,8 +33,4 @@ def draw(path: Path, seconds: float, curves: Mapping[str, Sequence[float]]) -> P
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.25, linewidth=0.5)
     all_axes[-1].set_xlabel("time in the clip, s", fontsize=8)
-    try:
-        figure.savefig(path, format="png")
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
-    return path
+    return saved(figure, path)

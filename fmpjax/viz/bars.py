@@ -6,7 +6,7 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from fmpjax.errors import UserError
+from fmpjax.viz.pictures import saved
 
 Bar = tuple[str, float, float, float]  # what it is of, the share, and the ends of its interval
 
@@ -42,8 +42,4 @@ def draw(path: Path, groups: Sequence[tuple[str, Sequence[Bar]]], title: str) ->
     axes.set_title(title, fontsize=9, loc="left", pad=10)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
-    try:
-        figure.savefig(path, format="png")
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
-    return path
+    return saved(figure, path)

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from fmpjax.errors import UserError
+from fmpjax.viz.pictures import saved
 
 
 def draw(path: Path, ahead: Sequence[float], turn: Sequence[float], maps: dict[str, np.ndarray]) -> Path:
@@ -38,8 +38,4 @@ def draw(path: Path, ahead: Sequence[float], turn: Sequence[float], maps: dict[s
         axes.set_xlabel("commanded turning, rad/s", fontsize=8)
         axes.set_ylabel("commanded speed, m/s", fontsize=8)
         axes.set_title(title, fontsize=9, loc="left")
-    try:
-        figure.savefig(path, format="png")
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
-    return path
+    return saved(figure, path)

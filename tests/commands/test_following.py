@@ -1,13 +1,17 @@
 """Figures of policies that follow the time in a clip."""
 
 import json
+from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fmpjax import cli, following, runs
+from fmpjax import cli, following, robots, runs
 from fmpjax.config import preset
 from fmpjax.errors import UserError
+from fmpjax.frames import FrameLayout
 from fmpjax.trainer import Trainer
 from tests.helpers import TINY, settings
 
@@ -62,6 +66,45 @@ def test_a_fall_counts_where_it_happens_and_ends_what_is_measured():
     assert [i for i, falls in enumerate(found.part_falls) if falls] == [10]
     assert (found.part_finished[0], found.part_finished[6]) == (1.0, 0.0)
     assert found.excursion == 1.0  # of the other episode
+
+
+def test_key_points_are_in_the_own_heading():
+    """A robot that faces +y, with a point ahead of it and one to its left, above."""
+    robot = robots.load("unitree_g1")
+    layout = FrameLayout.of(robot)
+    frame = np.zeros((2, layout.size), np.float32)
+    frame[:, layout.rotation] = [0, 1, 0, 0, 0, 1]
+    frame[:, layout.key_points.start : layout.key_points.start + 6] = [0, 2, 0.5, -3, 0, 0.7]
+    found = following._points(SimpleNamespace(robot=robot), jnp.asarray(frame))
+    np.testing.assert_allclose(found[0, :2], [[2, 0, 0.5], [0, 3, 0.7]], atol=1e-6)
+
+
+def test_what_is_wanted_is_the_frame_after_the_step(monkeypatch, walk):
+    """A robot that is put on the clip's next frame at each step has no error, and one on the frame before has."""
+    trainer = Trainer(preset("smoke", **TINY, **{"command.kind": "phase"}), walk)
+    frames, qpos = trainer.env.clip_frames, jnp.asarray(trainer.env.library.qpos, jnp.float32)
+
+    def play(late):
+        def step(trainer, env, policy, now, alive, drawn):
+            command, over, _ = env.command.advance(now.command, None, now.observed.frame)
+            row = command - late
+            observed = now.observed._replace(frame=frames[row])
+            physics = now.physics._replace(qpos=qpos[row])
+            now = now._replace(command=command, observed=observed, physics=physics)
+            return SimpleNamespace(now=now, alive=alive & ~over, fell=jnp.zeros_like(alive))
+
+        monkeypatch.setattr(following.frozen, "step", step)
+        following._play.clear_cache()
+        return following.measure(
+            trainer, trainer.ppo.init(jax.random.PRNGKey(0), trainer.env.clip_observations), episodes=3
+        )
+
+    right, late = play(0), play(1)
+    following._play.clear_cache()
+    assert right.finished == 3
+    assert max(right.joint_error, right.root_error, right.height_error, right.key_point_error) < 1e-6  # float32's
+    assert right.excursion == pytest.approx(1.0, abs=1e-6)
+    assert late.joint_error > 1e-3 and late.root_error == pytest.approx(0.86 / 50, rel=0.1)
 
 
 @pytest.mark.slow
