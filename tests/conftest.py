@@ -6,7 +6,9 @@ leaves out the checks of the shapes that functions state.
 
 import gc
 import os
+import sys
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 # Before JAX is imported: the figures the tests compare are those of the CPU unless the caller says otherwise.
@@ -43,6 +45,17 @@ from fmpjax import motion, robots  # noqa: E402
 # What is imported stays, and tracing makes many small objects: collecting them as often as usual takes a twentieth.
 gc.freeze()
 gc.set_threshold(50_000, 20, 50)
+
+# Processes that tests start run this checkout's code, and without Warp, whose import takes them seconds.
+WITHOUT_WARP = str(Path(__file__).parent / "without_warp")
+os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[1]), WITHOUT_WARP])
+sys.path[:] = [path for path in sys.path if path != WITHOUT_WARP]  # where this is such a process itself, of xdist
+
+
+def pytest_collection_modifyitems(items):
+    """Files with the most slow tests come first: none is left for one process at the end."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,6 @@ import pytest
 
 from fmpjax import cli, motion, robots, runs
 from fmpjax.config import preset
-from tests.helpers import ROOT
 
 JOINTS = robots.load("unitree_g1").joint_count
 TRAIN = ("train", "--preset", "smoke")
@@ -253,10 +252,7 @@ def test_every_setting_is_shown(capsys):
 def test_process_says_one_sentence(tmp_path):
     """In a process of its own nothing that the imports say gets between the user and the sentence."""
     command = [sys.executable, "-m", "fmpjax.cli", "train", "--preset", "smoke", "--method", "nope", "--run", "run"]
-    root = str(ROOT)
-    done = subprocess.run(
-        command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": root}, capture_output=True, text=True, timeout=120
-    )
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2
     assert done.stderr.startswith("fmpjax: unknown method 'nope'") and done.stderr.count("\n") == 1, done.stderr
     assert done.stdout == "", done.stdout

@@ -7,7 +7,6 @@ import sys
 import pytest
 
 from fmpjax import machine
-from tests.helpers import ROOT
 
 # A system with neither an affinity nor /proc nor /sys, as macOS is, before anything of the package is imported. Where
 # there is no fcntl, what trains goes without its lock.
@@ -29,8 +28,8 @@ builtins.open = io.open = bare
 
 def run(code, **environment):
     """What a Python process prints, where it does not fail."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT)} | environment
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300)
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -95,7 +94,7 @@ def test_mujoco_is_imported_whatever_its_variable_says(asked):
 def test_a_command_says_that_its_renderer_is_another(tmp_path):
     """OpenGL, whose import for the first platform failed, is imported again for another."""
     command = [sys.executable, "-m", "fmpjax.cli", "motion", "view", "strider_walk", "--robot", "strider"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "MUJOCO_GL": "wrong"}
+    environment = os.environ | {"MUJOCO_GL": "wrong"}
     command += ["--out", str(tmp_path / "walk.png")]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

@@ -11,7 +11,6 @@ from jaxtyping import TypeCheckError
 
 from fmpjax import features, learning, potential, priors, rotations, transport
 from fmpjax.priors import flow
-from tests.helpers import ROOT
 
 checked = pytest.mark.skipif(os.environ.get("FMPJAX_TEST_SHAPES") == "0", reason="shapes are not checked")
 ONE = jnp.float32(1.0)
@@ -47,6 +46,5 @@ def test_users_pay_nothing_for_it():
     """In a process of its own: without the hook nothing is checked, and the checker is not even imported."""
     looked = "import sys, jax.numpy as jnp\nfrom fmpjax import learning\n"
     looked += "learning.standardize(jnp.ones((3, 2)), jnp.ones(1), jnp.ones(1), 5.0)\nprint('beartype' in sys.modules)"
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", looked], env=environment, capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", looked], capture_output=True, text=True, timeout=120)
     assert done.stdout == "False\n", done.stderr

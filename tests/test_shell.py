@@ -12,7 +12,6 @@ import pytest
 import fmpjax
 from fmpjax import cli, cli_train, config, experiments, motion, priors, robots
 from fmpjax.experiments.common import results
-from tests.helpers import ROOT
 
 
 def _experiments():
@@ -43,7 +42,7 @@ def shown(capsys, monkeypatch):
 
 
 def _process(*arguments, **options):
-    environment = os.environ | {"PYTHONPATH": str(ROOT)} | options.pop("env", {})
+    environment = os.environ | options.pop("env", {})
     return subprocess.Popen([sys.executable, *arguments], env=environment, text=True, **options)
 
 

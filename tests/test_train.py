@@ -5,7 +5,6 @@ import dataclasses
 import fcntl
 import json
 import logging
-import os
 import re
 import shutil
 import signal
@@ -28,7 +27,7 @@ from fmpjax.evaluate import Episodes, Evaluation, Evaluator
 from fmpjax.logs import MetricsLog
 from fmpjax.priors import Expert
 from fmpjax.trainer import Trainer
-from tests.helpers import ROOT, TINY, settings, tiny
+from tests.helpers import TINY, settings, tiny
 
 
 def command(*arguments):
@@ -208,7 +207,6 @@ def test_a_resume_in_a_new_process_is_exact(trained, stopped):
     assert Checkpoints(stopped).latest() == 2 and len(rows(stopped)) == 1
     done = subprocess.run(
         command("train", "--resume", "--run", stopped),
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         timeout=500,
@@ -255,7 +253,6 @@ def test_sigterm_saves_and_ends_well(tmp_path):
     changes = TINY | {"transitions": 64 * 20_000, "evaluations": (1.0,)}
     process = subprocess.Popen(
         command("train", "--preset", "smoke", "--run", folder, *settings(changes)),
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

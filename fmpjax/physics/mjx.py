@@ -100,12 +100,17 @@ class MjxPhysics:
             if traits:
                 fields = changed(self._nominal, unpacked(traits[0]), jnp)
                 model = model.tree_replace({name: jnp.asarray(x, qpos.dtype) for name, x in fields.items()})
+
+            def step(data, targets):
+                data = data if targets is None else data.replace(ctrl=targets)
+                own = _saturated(model, data) if self.config.impl == "jax" else model
+                return mjx.step(own, data), None
+
             data = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
             if (several := targets.reshape(-1, self.model.nu)).shape[0] > 1:
-                data, _ = jax.lax.scan(lambda d, x: (mjx.step(model, d.replace(ctrl=x)), None), data, several)
+                data, _ = jax.lax.scan(step, data, several)
             else:
-                data = data.replace(ctrl=targets)
-                data, _ = jax.lax.scan(lambda d, _: (mjx.step(model, d), None), data, None, length=self.config.substeps)
+                data, _ = jax.lax.scan(step, data.replace(ctrl=targets), None, length=self.config.substeps)
             reached = data.qpos, data.qvel, data.qacc_warmstart
             if not self._overflow:
                 return reached
@@ -116,6 +121,20 @@ class MjxPhysics:
         # TF32 in the constraint solver lets contacts sink.
         with jax.default_matmul_precision("highest"):
             return jax.vmap(one)(*arguments)
+
+
+def _saturated(model: mjx.Model, data: mjx.Data) -> mjx.Model:
+    """The model with a constant force in place of each servo that is at its force limit.
+
+    The implicit integrator then adds no damping for it, as in MuJoCo C and in Warp. MJX in JAX adds it all the same.
+    """
+    gain, bias, (low, high) = model.actuator_gainprm, model.actuator_biasprm, model.actuator_forcerange.T
+    force = gain[:, 0] * data.ctrl + bias[:, 0] + bias[:, 1] * data.qpos[7:] + bias[:, 2] * data.qvel[6:]
+    full = ((force <= low) | (force >= high))[:, None]
+    constant = jnp.zeros_like(bias).at[:, 0].set(jnp.clip(force, low, high))
+    return model.tree_replace(
+        {"actuator_gainprm": jnp.where(full, 0.0, gain), "actuator_biasprm": jnp.where(full, constant, bias)}
+    )
 
 
 def _refuse(why: str) -> NoReturn:

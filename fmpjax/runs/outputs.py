@@ -172,12 +172,16 @@ def video(
     path: Path | None = None,
     alone: bool = False,
 ) -> Path:
-    """The policy beside the demonstration, or alone, as a video; the path written."""
+    """The policy beside the demonstration, or alone, as a video; the path written.
+
+    It lasts ``seconds``, or until one second after the fall of a policy that falls before.
+    """
     rate = trainer.config.control_rate
     stride = 2  # 25 pictures a second
     episode = _longest(played)
-    last = min(int(seconds * rate), len(played.qpos))
-    shown = {"policy": played.qpos[: min(last, int(played.length[episode])) : stride, episode]}
+    length = int(played.length[episode])
+    last = min(int(seconds * rate), len(played.qpos), length + int(rate))
+    shown = {"policy": played.qpos[: min(last, length) : stride, episode]}
     if not alone:
         shown["demonstration"] = trainer.library.clips[played.clip[episode]].qpos[:last:stride]
     panes = len(shown)

@@ -18,7 +18,11 @@ from fmpjax.experiments import ablate
 from fmpjax.experiments.common import cells, table
 from tests import helpers
 
-TINY = helpers.TINY | {"transitions": 8 * 8 * 2, "chunk": 1, "evaluations": (0.5, 1.0)}
+TINY = helpers.TINY | {"transitions": 8 * 8 * 4, "evaluations": (0.5, 1.0)}  # two chunks
+
+
+def toml(settings):
+    return "\n".join(f'"{key}" = {json.dumps(value)}' for key, value in settings.items())
 
 
 def specification(path, text):
@@ -112,9 +116,8 @@ def test_errors_exit_with_code_two(tmp_path, capsys):
 def ablated(tmp_path_factory):
     """Two tiny cells, run at once, and what `ablate` wrote of them."""
     folder = tmp_path_factory.mktemp("ablate")
-    settings = "\n".join(f'"{key}" = {json.dumps(value)}' for key, value in TINY.items())
     (folder / "plan.toml").write_text(
-        f'preset = "smoke"\nmethods = ["fmp", "barycentric"]\nresets = ["fixed"]\n[settings]\n{settings}\n'
+        'preset = "smoke"\nmethods = ["fmp"]\nresets = ["dataset"]\nseeds = [0, 1]\n[settings]\n' + toml(TINY)
     )
     ablate.cli(["--spec", str(folder / "plan.toml"), "--out", str(folder / "out"), "--workers", "2"])
     return folder, cells.plan(cells.read_specification(folder / "plan.toml"))
@@ -122,9 +125,11 @@ def ablated(tmp_path_factory):
 
 @pytest.mark.slow
 def test_sigterm_ends_the_cells_too(tmp_path):
-    out = tmp_path / "out"
+    out, plan = tmp_path / "out", tmp_path / "plan.toml"
+    endless = TINY | {"transitions": 64 * 20_000, "evaluations": (1.0,)}
+    plan.write_text('preset = "smoke"\nmethods = ["fmp"]\n[settings]\n' + toml(endless))
     process = subprocess.Popen(
-        [sys.executable, "-m", "fmpjax.experiments.ablate", "--preset", "smoke", "--methods", "fmp", "--out", str(out)],
+        [sys.executable, "-m", "fmpjax.experiments.ablate", "--spec", str(plan), "--out", str(out)],
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     log, until = out / "fmp-dataset" / "seed0.log", time.monotonic() + 300
@@ -146,16 +151,15 @@ def test_ablate_writes_tables_and_curves(ablated):
     assert all(cells.finished(cell, folder / "out") for cell in planned)
     results = json.loads((folder / "out" / "results.json").read_text())
     assert [(e["cell"], e["transitions"]) for e in results["evaluations"]] == [
-        ("fmp-fixed/seed0", 64), ("fmp-fixed/seed0", 128),
-        ("barycentric-fixed/seed0", 64), ("barycentric-fixed/seed0", 128),
+        ("fmp-dataset/seed0", 128), ("fmp-dataset/seed0", 256), ("fmp-dataset/seed1", 128), ("fmp-dataset/seed1", 256),
     ]  # fmt: skip
     assert results["provenance"]["python"]
-    made = json.loads((folder / "out" / "fmp-fixed/seed0" / "provenance.json").read_text())
-    assert results["runs"]["fmp-fixed/seed0"]["commit"] == made["commit"]
+    made = json.loads((folder / "out" / "fmp-dataset/seed0" / "provenance.json").read_text())
+    assert results["runs"]["fmp-dataset/seed0"]["commit"] == made["commit"]
     assert str(folder) not in (folder / "out" / "results.json").read_text()
     rows = table.evaluations(planned[0], folder / "out")
-    saved = json.loads((folder / "out" / "fmp-fixed/seed0" / "config.json").read_text())
-    assert (rows[-1].method, rows[-1].reset, rows[-1].seed) == ("fmp", "fixed", saved["seed"])
+    saved = json.loads((folder / "out" / "fmp-dataset/seed0" / "config.json").read_text())
+    assert (rows[-1].method, rows[-1].reset, rows[-1].seed) == ("fmp", "dataset", saved["seed"])
 
 
 @pytest.mark.slow
@@ -163,23 +167,23 @@ def test_finished_cells_are_left_alone_and_unfinished_ones_go_on(ablated, capsys
     """A cell cut back to half its course, as a kill would leave it, is finished; the other is not touched."""
     folder, planned = ablated
     out = folder / "out"
-    cell = out / "fmp-fixed/seed0"
+    cell = out / "fmp-dataset/seed0"
     before = (cell / "metrics.csv").read_text().splitlines()
-    assert {p.name for p in (cell / "checkpoints").iterdir() if p.name.isdigit()} == {"1", "2"}
-    shutil.rmtree(cell / "checkpoints" / "2")
-    shutil.rmtree(cell / "best" / "2", ignore_errors=True)
-    stamp = (out / "barycentric-fixed/seed0" / "metrics.csv").stat().st_mtime_ns
+    assert {p.name for p in (cell / "checkpoints").iterdir() if p.name.isdigit()} == {"2", "4"}
+    shutil.rmtree(cell / "checkpoints" / "4")
+    shutil.rmtree(cell / "best" / "4", ignore_errors=True)
+    stamp = (out / "fmp-dataset/seed1" / "metrics.csv").stat().st_mtime_ns
     (cell / "evaluation.json").unlink()
     assert not cells.finished(planned[0], out)
     cells.run(planned, out, workers=2)  # on as many cores as before, on which its last bits depend in the tests
     assert cells.finished(planned[0], out)
-    assert (out / "barycentric-fixed/seed0" / "metrics.csv").stat().st_mtime_ns == stamp
+    assert (out / "fmp-dataset/seed1" / "metrics.csv").stat().st_mtime_ns == stamp
     assert "2 cells, 1 of them finished before" in capsys.readouterr().out
     # Its first half was not trained again, training time included; the second is the same but for its own.
     after = (cell / "metrics.csv").read_text().splitlines()
     assert after[:2] == before[:2] and len(after) == 3
     values = [line.split(",") for line in (before[2], after[2])]
-    assert values[0][:2] == values[1][:2] == ["2", "128"] and values[0][3:] == values[1][3:]
+    assert values[0][:2] == values[1][:2] == ["4", "256"] and values[0][3:] == values[1][3:]
     (again,) = json.loads((cell / "provenance.json").read_text())["resumed"]
     assert again["command"].startswith("fmpjax train --preset smoke --set=")
 
@@ -187,11 +191,9 @@ def test_finished_cells_are_left_alone_and_unfinished_ones_go_on(ablated, capsys
 @pytest.mark.slow
 def test_results_of_another_configuration_are_refused(ablated):
     folder, _ = ablated
-    other = cells.plan(
-        cells.Specification(preset="smoke", methods=("fmp",), resets=("fixed",), settings=TINY | {"ppo.discount": 0.5})
-    )
+    other = cells.plan(cells.Specification(preset="smoke", methods=("fmp",), settings=TINY | {"ppo.discount": 0.5}))
     with pytest.raises(
-        UserError, match=r"fmp-fixed/seed0 holds a run with ppo.discount 0.97, not 0.5: name another --out"
+        UserError, match=r"fmp-dataset/seed0 holds a run with ppo.discount 0.97, not 0.5: name another --out"
     ):
         cells.run(other, folder / "out")
 

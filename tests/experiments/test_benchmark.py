@@ -265,7 +265,8 @@ def test_a_new_prior_is_one_file_and_one_line(tmp_path, monkeypatch):
 @needs_submitit
 def test_a_killed_cell_continues_to_its_end_and_is_then_left_alone(tmp_path, capsys):
     """A process of this machine is killed after its first checkpoint; submitit's continues from there."""
-    planned, run = small("barycentric"), tmp_path / "barycentric-dataset-walk" / "seed0"
+    planned = cells.plan(Specification(preset="smoke", methods=("fmp",), resets=("dataset",), settings=SMALL))
+    run = tmp_path / "fmp-dataset" / "seed0"
     engine = engines.Processes(1)
     engine.start(cells._tasks(planned, tmp_path, together=False))
     until = time.monotonic() + 400
@@ -275,7 +276,7 @@ def test_a_killed_cell_continues_to_its_end_and_is_then_left_alone(tmp_path, cap
 
     while not saved() and engine.running() and time.monotonic() < until:
         time.sleep(0.02)
-        assert engine.ended() == [], (tmp_path / "barycentric-dataset-walk" / "seed0.log").read_text()
+        assert engine.ended() == [], (tmp_path / "fmp-dataset" / "seed0.log").read_text()
     ((_, process),) = engine._running.values()
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()

@@ -128,21 +128,6 @@ def test_joint_friction_is_refused_by_mjx(robot):
         physics.make(robot, dataclasses.replace(LAPTOP, backend="mjx"), joint_friction=True)
 
 
-@pytest.mark.slow
-def test_mjx_agrees_on_traits(robot, states):
-    qpos, qvel, targets = states
-    own = other(robot)._replace(joint_friction=nominal(robot).joint_friction)
-    config = dataclasses.replace(LAPTOP, iterations=50, ls_iterations=50)
-    start = physics.reset(qpos, qvel)
-    several = jnp.stack([targets, targets + 0.1], axis=1)
-    native_step = physics.make(robot, config)
-    mjx_step = physics.make(robot, dataclasses.replace(config, backend="mjx"))
-    a, b = (jax.jit(backend.step)(start, several, own) for backend in (native_step, mjx_step))
-    # In the fourth state MJX differs from MuJoCo C without any traits, too.
-    np.testing.assert_allclose(a.qpos[:3], b.qpos[:3], atol=2e-4)
-    np.testing.assert_allclose(a.qvel[:3], b.qvel[:3], atol=2e-2)
-
-
 def test_a_robot_without_a_torso_is_refused(robot):
     nameless = dataclasses.replace(robot, landmarks={})
     with pytest.raises(UserError, match=r"robot unitree_g1 has no chest among the \[landmarks\] of its robot.toml"):

@@ -14,7 +14,6 @@ from fmpjax import robots, runs
 from fmpjax.errors import UserError
 from fmpjax.runs import outputs
 from fmpjax.viz import curves, opengl, render, video
-from tests.helpers import ROOT
 
 SIZE = {"width": 96, "height": 72}
 
@@ -146,7 +145,7 @@ def test_a_driver_that_fails_after_all_leaves_the_skeleton(robot, walk, monkeypa
 def test_a_dead_display_gives_a_picture_and_a_sentence(tmp_path):
     """In a process of its own: MuJoCo's viewer would end it."""
     command = [sys.executable, "-m", "fmpjax.cli", "motion", "view", "strider_walk", "--robot", "strider"]
-    environment = os.environ | {"DISPLAY": ":77", "PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"DISPLAY": ":77"}
     environment.pop("WAYLAND_DISPLAY", None)
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
