@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import os
 import time
 from collections.abc import Sequence
@@ -34,11 +35,17 @@ def runs_module():
     return runs
 
 
+@functools.cache
+def _preset(name: str) -> dict[str, object]:
+    """The settings of a preset by their keys. Every start of the program asks for each of them several times."""
+    return configuration.flatten(configuration.preset(name))
+
+
 def _setting(key: str) -> object:
     """For ``Annotated``: the default of an option that overrides a setting, which may depend on the preset."""
     presets: dict[str, list[str]] = {}
     for name in configuration.PRESETS:
-        value = configuration.flatten(configuration.preset(name))[key]
+        value = _preset(name)[key]
         presets.setdefault(f"{value:,}" if isinstance(value, int) else value, []).append(name)
     if len(presets) == 1:
         return default(*presets)

@@ -27,6 +27,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 # A device that waits for the others holds one of the threads of XLA, which makes one a core: too few are a deadlock.
 os.environ.setdefault("NPROC", str(2 * max(os.cpu_count() or 1, 4)))
 
+import jax
 import jaxtyping
 import pytest
 
@@ -56,6 +57,16 @@ def pytest_collection_modifyitems(items):
     """Files with the most slow tests come first: none is left for one process at the end."""
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_programs():
+    """Compiled programs are let go before they are too many: each has memory maps, of which Linux allows 65,530."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 20_000:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")
