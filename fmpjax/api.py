@@ -55,7 +55,9 @@ def train(
         run = Run.open(folder)
     else:
         if config is not None and command is not None:
-            raise UserError("command goes with a preset: of a Config, set command.kind, motion and the axes yourself")
+            raise UserError(
+                "command and a Config were given: expected command.kind, motion and the axes to be set in the Config"
+            )
         run = _created(config, preset, folder, configuration.commanded(command, settings))
     left = None if minutes is None else minutes - (time.monotonic() - began) / 60
     if runs.train(run, resume=resume, minutes=left, logger=logger) is not runs.End.SIGNAL:

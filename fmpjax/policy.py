@@ -58,7 +58,7 @@ class Policy(NamedTuple):
         if length != self.mean.shape:
             raise UserError(
                 f"the observation has {length[0] if length else 'no'} numbers: expected {len(self.mean)}, "
-                f"as the {self.observation!r} observation of this policy has"
+                f"for the observation {self.observation!r} of this policy"
             )
         x = np.clip((observation - self.mean) / self.deviation, -self.clip, self.clip)
         for kernel, bias in zip(self.kernels[:-1], self.biases[:-1], strict=True):

@@ -78,7 +78,7 @@ def measure(
     if config.transitions_per_iteration < targets:
         raise UserError(
             f"the first rollout has {config.transitions_per_iteration} windows: expected at least {targets}, "
-            "one a target"
+            "one per target"
         )
     updates = {
         fraction: jax.jit(_prior_at(trainer, fraction).update)

@@ -372,7 +372,7 @@ def test_faults(robot, source, monkeypatch):
         values = source.values.copy()
         values[:, 3:6] += [90.0, 0.0, 0.0]  # lies on its side
         retarget.retarget(source._replace(values=values), robot, "walk")
-    with pytest.raises(UserError, match="walk: the skeleton's left_hip and left_knee are at one place"):
+    with pytest.raises(UserError, match="walk: the skeleton's left_hip and left_knee are at the same place"):
         values = source.values.copy()
         at = 6 * source.names.index("LeftLeg")
         values[:, at : at + 3] = 0.0
