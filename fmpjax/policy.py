@@ -36,7 +36,7 @@ class Policy(NamedTuple):
     biases: tuple[np.ndarray, ...]  # [out]
     mean: np.ndarray  # [O], of the observations in training
     deviation: np.ndarray  # [O]
-    clip: float  # of normalised observations
+    clip: float  # of normalized observations
     center: np.ndarray  # [J] rad, the targets of action zero
     scale: np.ndarray  # [J] rad, a unit of action
     low: np.ndarray  # [J] rad, of the targets

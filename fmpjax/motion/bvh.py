@@ -2,7 +2,7 @@
 
 A file has a ``HIERARCHY`` (joints with an ``OFFSET`` in their parent and ``CHANNELS`` in any order, ``End Site`` where
 a limb ends) and a ``MOTION`` (one line of channel values a frame). Axes and lengths are the file's own, usually y up
-and centimetres; angles are degrees. A joint turns by its rotation channels in the order written, each about an axis
+and centimeters; angles are degrees. A joint turns by its rotation channels in the order written, each about an axis
 that the ones before have turned. A position channel replaces the offset's component.
 """
 

@@ -120,7 +120,7 @@ def test_windows_lie_within_a_clip(two, env):
     assert ends.tolist() == [*range(9, 30), *range(39, 230)]
     heights = np.asarray(env.clip_windows())[..., 2]
     assert heights.shape == (212, HORIZON)
-    # No window has feet on the floor and a metre above it.
+    # No window has feet on the floor and a meter above it.
     assert np.ptp(heights, axis=1).max() < 0.2
 
 

@@ -98,7 +98,7 @@ def done(robot, source):
 
 def test_walk_comes_back(robot, second, done):
     assert done.clip.rate == pytest.approx(30)
-    assert done.scale == pytest.approx(0.01, rel=1e-3)  # the file is in centimetres
+    assert done.scale == pytest.approx(0.01, rel=1e-3)  # the file is in centimeters
     assert done.residual.max() < 0.012
     error = done.clip.qpos - second.qpos
     # The hip of the walk is not quite fixed in the pelvis, as a human's is.
