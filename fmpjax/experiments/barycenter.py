@@ -288,7 +288,7 @@ def main(
       seed: of everything random in the first draw; the next has the next seed.
       draws: first rollouts, each with a policy, starts and banks of its own.
       entropies: further entropies over the median cost to match at, beside the preset's.
-      smoke: the whole path, small.
+      smoke: a small test run.
     """
     from fmpjax import runs
 
