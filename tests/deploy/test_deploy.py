@@ -192,7 +192,7 @@ def test_the_parts_of_the_observation_are_what_is_observed(name):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda p: {"observation": "full"}, r"input of layer 0 has \d+ numbers: expected 237, as 29 joints"),
+        (lambda p: {"observation": "full"}, r"input of layer 0 has \d+ numbers: expected 237, for 29 joints"),
         (lambda p: {"mean": p.mean[1:]}, r"normalizer has \d+ numbers: expected \d+"),
         (lambda p: {"scale": p.scale[1:]}, "scale has 28 numbers: expected 29"),
         (lambda p: {"kernels": (*p.kernels[:-1], p.kernels[-1][:, 1:])}, "output of the last layer has 28 numbers"),
@@ -535,8 +535,8 @@ def test_a_model_or_file_that_does_not_fit_is_refused(exported, robot, tmp_path)
     for key, value, sentence in (
         ("action_scale", None, "has no metadata 'action_scale'"),
         ("action_scale", "1,nan", "'1,nan' is not finite"),
-        ("action_scale", "1,1", "has 2 of scale: expected one per joint, 29"),
-        ("joint_loads", "1,1", "has 2 of joint_loads: expected one per joint, 29"),
+        ("action_scale", "1,1", "has 2 values of scale: expected 29, one per joint"),
+        ("joint_loads", "1,1", "has 2 values of joint_loads: expected 29, one per joint"),
         ("key_points", "[1]", "has metadata that cannot be read"),
         ("observation_terms_scale", "1.0,2.0", "observation_terms_scale is 2.0, and sim2sim knows only 1.0"),
         ("step_dt", "often", "has metadata that cannot be read"),

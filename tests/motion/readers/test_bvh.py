@@ -110,7 +110,7 @@ def test_layout_does_not_matter(write):
         ("HIERARCHY", "", "line 1 is '', expected HIERARCHY"),
         ("HIERARCHY", "SKELETON", "line 1 is 'SKELETON', expected HIERARCHY"),
         ("MOTION", "", "no line MOTION"),
-        ("  OFFSET 1 2 3\n", "", "line 18 ends joint 'Hips', expected its OFFSET before"),
+        ("  OFFSET 1 2 3\n", "", "line 18 ends joint 'Hips', expected its OFFSET first"),
         ("OFFSET 1 2 3", "OFFSET 1 2", "line 4 has 'CHANNELS', expected a number"),
         ("OFFSET 1 2 3", "OFFSET 1 nan 3", "line 4 has 'nan', expected a number"),
         ("OFFSET 1 2 3", "OFFSET 1 2 3 4", "line 4 has '4' within joint 'Hips'"),

@@ -185,7 +185,7 @@ def test_it_says_which_file_the_user_must_bring(amass, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"trans": np.zeros((39, 3))}, "39 places of the body and 40 poses"),
+        ({"trans": np.zeros((39, 3))}, "39 positions of the body and 40 poses"),
         ({"poses": np.zeros((40, 63))}, "poses have 63 columns, expected 66 or more"),
         ({"poses": np.full((40, 66), np.nan)}, "poses row 0, column 0 is nan"),
         ({"poses": np.float64(1.0)}, "poses is float64 of shape ()"),
