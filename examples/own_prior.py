@@ -1,8 +1,7 @@
 """A motion prior of your own in forty lines: a window earns more, the nearer it is to any window of the demonstration.
 
-Nothing is fitted. One sees the progress, evaluation and diagnosis that the ten built-in methods have: with ``smoke``
-after a minute, of a robot that falls; with ``laptop`` after a quarter of an hour. How well this prior teaches was not
-measured.
+Nothing is fitted. The run has the same progress, evaluation and diagnosis as with a built-in method. ``smoke`` takes a
+minute and its robot falls; ``laptop`` takes a quarter of an hour. How well policies learn from it was not measured.
 
     python examples/own_prior.py laptop
 """

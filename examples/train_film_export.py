@@ -1,6 +1,6 @@
-"""Train a policy, film it, export it, and ask the exported policy, which is a function of NumPy arrays.
+"""Train a policy, film it, export it, and call the exported policy, which is a function of NumPy arrays.
 
-With the preset ``smoke`` all of this takes a minute, and the film shows a robot that falls: nothing is learned. With
+With the preset ``smoke`` this takes a minute, and the film shows a robot that falls, because nothing is learned. With
 ``laptop`` it takes a quarter of an hour on two cores, and the robot walks.
 
     python examples/train_film_export.py laptop

@@ -1,12 +1,12 @@
 """The transport score on a toy, and on windows of motion.
 
-On a line, the policy's samples are around 0 and the demonstration's around -1 and 1. One sees that the gradient of the
-score points to the nearer of the two from either side. The middle, which is the mean of the demonstration, has the
+In the toy, the policy's samples are around 0 and the demonstration's are around -1 and 1. On either side,
+the gradient of the score points to the nearer of the two. The middle, which is the mean of the demonstration, has the
 lowest score: the score does not reward averages.
 
-Then the same function scores windows of a robot's motion, ten frames each. The policy's are those of the slow walk, the
-demonstration's those of the walk. One sees which motions score above the slow walk, and that running the demonstration
-backward costs score.
+Then the same function scores windows of a robot's motion, ten frames each. The policy's windows are those of the slow
+walk, the demonstration's those of the walk. The output shows which motions score above the slow walk, and that playing
+the demonstration backward lowers the score.
 """
 
 import jax.numpy as jnp

@@ -32,7 +32,7 @@ class ActionRule(NamedTuple):
 
     Its random numbers are separate, so that a rollout draws those of all its steps at once.
 
-    ``act(observation [N, O], drawn) -> action [N, J], extras``: normalised actions and what to remember of them, each
+    ``act(observation [N, O], drawn) -> action [N, J], extras``: normalized actions and what to remember of them, each
     ``[N, ...]``. ``draw(key, (N,)) -> drawn``: the random numbers of one step; the key itself unless told otherwise.
     """
 

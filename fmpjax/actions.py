@@ -11,7 +11,7 @@ from fmpjax.robots import Robot
 
 
 class ActionMap(NamedTuple):
-    """Joint targets (rad) from normalised actions: clip(center + scale * a, low, high); each ``[J]``."""
+    """Joint targets (rad) from normalized actions: clip(center + scale * a, low, high); each ``[J]``."""
 
     center: np.ndarray
     scale: np.ndarray

@@ -26,24 +26,24 @@ def train(
     """Train a policy from a demonstration, as the command ``fmpjax train`` does, and return its run.
 
     At the end the best policy is evaluated, and its figures, curves and film are written into the run folder. Ctrl-C
-    (an interrupted notebook cell) saves the run and ends it without them.
+    (or an interrupted notebook cell) saves the run and ends the training without these files.
 
     Args:
       config: the settings; by default those of ``preset``.
       command: what the policy is told, "none", "velocity", "phase" or "motion"; docs/steering.md.
       preset: the name of a preset; by default `laptop` on a CPU and `paper` on an accelerator.
       folder: the run folder; by default ``runs/METHOD-DATE-TIME``.
-      minutes: time that the training may take, its compilation and evaluations included.
-      resume: continue the run in ``folder``, with the settings that it has.
-      logger: "wandb" or "trackio" gets the figures of ``metrics.csv``, too; docs/metrics.md.
+      minutes: time limit, including compilation and evaluations.
+      resume: continue the run in ``folder`` with its own settings.
+      logger: "wandb" or "trackio", which also get the figures of ``metrics.csv``; docs/metrics.md.
       **settings: changes of the settings: ``method="amp"``, ``motion="walk.npz"``, ``**{"ppo.discount": 0.98}``.
 
     Returns:
       The run: ``run.folder``, ``run.config``, ``run.policy()``.
 
     Raises:
-      UserError: a setting is unknown or wrong, ``folder`` holds a run already, or none to resume, too much was not
-        finite, memory is too small, or a logger is missing; what was saved stays.
+      UserError: a setting is unknown or wrong, ``folder`` holds a run already or has none to resume, too many numbers
+        were not finite, memory is too small, or a logger is missing; saved checkpoints stay.
     """
     began = time.monotonic()
     if minutes is not None and not minutes > 0:
@@ -55,7 +55,9 @@ def train(
         run = Run.open(folder)
     else:
         if config is not None and command is not None:
-            raise UserError("command goes with a preset: of a Config, set command.kind, motion and the axes yourself")
+            raise UserError(
+                "command and a Config were given: expected command.kind, motion and the axes to be set in the Config"
+            )
         run = _created(config, preset, folder, configuration.commanded(command, settings))
     left = None if minutes is None else minutes - (time.monotonic() - began) / 60
     if runs.train(run, resume=resume, minutes=left, logger=logger) is not runs.End.SIGNAL:

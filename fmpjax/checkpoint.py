@@ -68,7 +68,7 @@ class Checkpoints:
         expected = _flatten(like)
         if set(saved) != set(expected):
             name = sorted(set(saved) ^ set(expected))[0]
-            raise UserError(f"checkpoint {folder} is of another configuration: {name} stands in only one of the two")
+            raise UserError(f"checkpoint {folder} is of another configuration: {name} is in only one of the two")
         for name, leaf in expected.items():
             if saved[name].shape != leaf.shape or saved[name].dtype != leaf.dtype:
                 raise UserError(
@@ -105,7 +105,7 @@ class Checkpoints:
         step = self.latest(best=best) if iteration is None else iteration
         kind = "best" if best else "checkpoints"
         if step is None:
-            raise UserError(f"run {self.run} has no checkpoint in {kind}/: expected one, train it first")
+            raise UserError(f"run {self.run} has no checkpoint in {kind}/: train the run first")
         folder = self.run / kind / str(step)
         try:
             with self._manager(kind, KEEP) as manager:

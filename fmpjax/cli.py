@@ -30,9 +30,9 @@ class Evaluate:
     last: bool = False
     """Take the newest checkpoint instead of the best."""
     commands: bool = False
-    """Measure how well a policy obeys the velocities, or follows the clip's time, that it is told; docs/steering.md."""
+    """Measure how well a policy follows its velocity commands, or the time in the clip; docs/steering.md."""
     robust: bool = False
-    """Measure how well any policy stays up under pushes, delays and other disturbances; docs/robustness.md."""
+    """Measure how often a policy falls under pushes, delays and other disturbances; docs/robustness.md."""
 
     def __call__(self) -> None:
         if self.commands and self.robust:
@@ -111,7 +111,7 @@ class Render:
     alone: bool = False
     """Leave the demonstration out; its license may forbid sharing pictures of it."""
     course: Annotated[tuple[str, ...], default("none")] = ()
-    """Of a policy that is told velocities: commands as 4:0.5,0,0.4, seconds, ahead and left (m/s), turning (rad/s)."""
+    """Commands for a policy with velocity commands: SECONDS:FORWARD,LEFT,TURN (m/s, rad/s), such as 4:0.5,0,0.4."""
 
     def __call__(self) -> None:
         runs = runs_module()
@@ -133,14 +133,14 @@ class Render:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Copy a run's results, without its states, to a folder, or write a page of its policy."""
+    """Copy a run's results without its checkpoints to a folder, or write a web page of its policy."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     out: Annotated[tyro.conf.Positional[Path | None], default("RUN/export")] = None
     """Folder to write."""
     onnx: bool = False
-    """Write policy.onnx and MODEL_CARD.md, too, for other programs; docs/deploy.md."""
+    """Also write policy.onnx and MODEL_CARD.md, for other programs; docs/deploy.md."""
     web: Annotated[Path | None, default("no page")] = None
     """New folder for a page on which the policy runs in a browser; nothing else is written unless asked for."""
 
@@ -178,10 +178,10 @@ class Diagnose:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """Gather what the experiments found on one page, ours beside the paper's."""
+    """Collect the results of the experiments on one page, beside the paper's."""
 
     folder: tyro.conf.Positional[Path]
-    """Folder below which their results are."""
+    """Folder with results, also in subfolders."""
     out: Annotated[Path | None, default("FOLDER/report.html")] = None
     """HTML page to write; the same in Markdown is written beside it."""
 

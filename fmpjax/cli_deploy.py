@@ -22,17 +22,17 @@ class Sim2Sim:
     seconds: float = 10.0
     """Greatest length of an episode, for a policy that takes no commands."""
     episodes: int = 8
-    """Starts from the default pose, all but the first with joints a little off."""
+    """Episodes from the default pose, all but the first with small random joint offsets."""
     gains: Literal["policy", "model"] = "policy"
-    """Whose gains the servos have: the policy's, or those of the model, which then needs position servos."""
+    """Gains of the servos: the policy's, or those of the model, which then needs position servos."""
     course: Annotated[tuple[str, ...], default("a walk, a turn and a stop")] = ()
-    """What a policy that takes commands is told, as SECONDS:FORWARD,LEFT,TURN in m/s and rad/s, leg after leg."""
+    """Commands for the policy, if it takes any, as SECONDS:FORWARD,LEFT,TURN in m/s and rad/s, leg by leg."""
     video: Annotated[Path | None, default("no video")] = None
     """Film the first episode: a file .mp4, or .gif where no encoder is installed."""
     keyboard: bool = False
-    """Steer it by the keys of MuJoCo's viewer, instead of episodes; needs a display."""
+    """Steer the robot with keys in MuJoCo's viewer instead of playing episodes; needs a display."""
     gamepad: bool = False
-    """The same with a gamepad, too."""
+    """The same, also with a gamepad."""
 
     def __call__(self) -> None:
         from fmpjax import robots, sim2sim

@@ -23,13 +23,13 @@ class Reading:
     frames: Annotated[str | None, default("all")] = None
     """Source rows first:last, 0-based, both included; 100: and :200 go to the file's end or from its start."""
     fps: Annotated[float | None, default("the file's own")] = None
-    """Rate of the source rows in place of the file's own, Hz."""
+    """Rate of the source rows, Hz, instead of the file's own."""
     robot: str = "unitree_g1"
-    """A robot under robots/."""
+    """A shipped robot, or a robot's folder."""
     quaternion: Annotated[str | None, default("told by the file")] = None
-    """Order of the root's quaternion in place of the format's: wxyz or xyzw."""
+    """Order of the root's quaternion, wxyz or xyzw, instead of the format's."""
     without: str = ""
-    """Joints that are not in the file, and stay at zero: words in their names, such as wrist,waist_roll."""
+    """Joints that are missing in the file and stay at zero: parts of their names, such as wrist,waist_roll."""
     degrees: bool = False
     """The file's joints are in degrees."""
     accept_license: bool = False
@@ -67,7 +67,7 @@ class Import(Reading):
     """Read motions of any format and write them as this package's own."""
 
     files: tyro.conf.Positional[tuple[str, ...]]
-    """Motion files or addresses of some; several are written to the folder --out under their own names."""
+    """Motion files, by path or address; several are written to the folder --out under their own names."""
     out: Path
     """File to write, .npz; a folder for several files."""
     rate: float = 50.0
@@ -75,9 +75,9 @@ class Import(Reading):
     mirror: bool = False
     """Reflect left and right."""
     heading: Annotated[float | None, default("as it is")] = None
-    """Turn the way from start to end to this angle from +x, deg."""
+    """Rotate the motion so that its way from start to end has this angle from +x, deg."""
     loop: bool = False
-    """Bend the last 0.4 s so that the end meets the start."""
+    """Change the last 0.4 s so that the last pose equals the first."""
     repeat: int = 1
     """Write a loop this many times in a row."""
     speed: float = 1.0
@@ -135,7 +135,7 @@ class Check(Source):
     """Print figures of a motion, healthy ranges and verdicts; exit code 1 if it is broken."""
 
     fix: bool = False
-    """Put the soles on the floor, take out flips, clip joints to their limits, say what was changed, check again."""
+    """Put the soles on the floor, remove flips, clip joints to their limits, print the changes, check again."""
     out: Annotated[Path | None, default("none")] = None
     """File to write the fixed motion to, .npz."""
     axes: str = "world"
@@ -231,20 +231,20 @@ class _Style(Style):
 
 @dataclasses.dataclass(frozen=True)
 class Synthesize:
-    """Write a steady walk of our own; --speed 0 alone is standing. With --grid, a library of them."""
+    """Synthesize a steady walk; --speed 0 alone gives standing. With --grid, a library of walks."""
 
     out: Path
     """File to write, .npz; a folder with --grid."""
     grid: bool = False
     """Write a walk for each combination of --speeds, --turns and --sides that the legs reach."""
     speeds: tuple[float, ...] = (0.0, 0.4, 0.8, 1.2)
-    """Of the grid, ahead, m/s."""
+    """Forward speeds of the grid, m/s."""
     turns: tuple[float, ...] = (-0.8, -0.4, 0.0, 0.4, 0.8)
-    """Of the grid, turning to the left, rad/s."""
+    """Turning rates of the grid, to the left, rad/s."""
     sides: tuple[float, ...] = (0.0,)
-    """Of the grid, to the left, m/s."""
+    """Sideways speeds of the grid, to the left, m/s."""
     speed: Annotated[float | None, default("the robot's own")] = None
-    """Ahead, m/s, negative backward."""
+    """Forward, m/s; negative is backward."""
     sideways: float = 0.0
     """To the left, m/s."""
     turn: float = 0.0
@@ -254,7 +254,7 @@ class Synthesize:
     rate: float = 50.0
     """Hz."""
     robot: str = "unitree_g1"
-    """A robot under robots/."""
+    """A shipped robot, or a robot's folder."""
     style: _Style = _Style()
     """How the walk looks: lengths m, angles rad, phases as fractions of a stride."""
 
@@ -295,13 +295,13 @@ class Retarget:
     frames: Annotated[str | None, default("all")] = None
     """Frames first:last of the file, 0-based, both included; 1: goes to the end."""
     robot: str = "unitree_g1"
-    """A robot under robots/."""
+    """A shipped robot, or a robot's folder."""
     skeleton: Annotated[Path | None, default("known names")] = None
-    """TOML file that names the skeleton's joints, where their names are not known, such as left_hip = "LThigh"."""
+    """TOML file with names of joints that fmpjax does not know, such as left_hip = "LThigh"."""
     up: Annotated[str | None, default("told by the file")] = None
-    """The file's axis that is up, y or z; by default the one along which hips are over ankles."""
+    """Vertical axis of the file, y or z; by default the one along which the hips are above the ankles."""
     body_model: Annotated[Path | None, default("none")] = None
-    """The body model (.npz) that SMPL's parameters are for, from its makers."""
+    """The body model (.npz) of the SMPL parameters, from its makers."""
     accept_license: bool = False
     """Accept the license of a Hugging Face data set without a question."""
 

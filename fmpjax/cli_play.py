@@ -16,11 +16,11 @@ class Play:
     """Play with policies in real time, in a page of the browser: command them, push them, compare checkpoints."""
 
     what: tyro.conf.Positional[tuple[Path, ...]]
-    """Run folders, also of runs that still train, and policies (policy.onnx, policy.npz), side by side."""
+    """Run folders, also of running trainings, and policies (policy.onnx, policy.npz), side by side."""
     checkpoint: Annotated[str | None, default("the best")] = None
     """Policy of the runs to begin with: `best`, `newest`, `live` (of `train --live`) or an iteration."""
     model: Annotated[Path | None, default("the robot of the training")] = None
-    """MJCF file with the joints of the policies, which then are files."""
+    """MJCF file with the joints of the policies, for policy files only."""
     host: str = "127.0.0.1"
     """Address to listen at; any other than this machine's own lets everyone in the network play."""
     port: int = 8080
@@ -28,7 +28,7 @@ class Play:
     native: bool = False
     """Open MuJoCo's own viewer instead of a page, for one policy; needs a display."""
     gamepad: bool = False
-    """Steer by a gamepad, too; with --native."""
+    """Also steer with a gamepad; needs --native."""
     parent: Annotated[int | None, tyro.conf.Suppress] = None
     """Of `train --live`: the process without which the page ends."""
 

@@ -30,7 +30,7 @@ def runs_module():
     except (RuntimeError, AssertionError):  # which of them depends on the plugins that are installed
         platforms = os.environ.get("JAX_PLATFORMS", "")
         raise UserError(
-            f"JAX_PLATFORMS is {platforms!r}, and no such device is there: expected cpu, or a device that JAX sees"
+            f"JAX_PLATFORMS is {platforms!r}, but JAX finds no such device: expected cpu, or a device of this machine"
         ) from None
     return runs
 
@@ -65,22 +65,22 @@ def _set(items: Sequence[str]) -> dict[str, str]:
 
 @dataclasses.dataclass(frozen=True)
 class Pretrain:
-    """Train what a method learns of the demonstration before any policy, and keep it for all runs."""
+    """Train what a method learns before the policy, and keep it for all runs."""
 
     method: tyro.conf.Positional[str]
     """`smp`, whose diffusion model is trained first."""
     preset: Annotated[str | None, default("laptop on a CPU, paper on an accelerator")] = None
     """`smoke`, `laptop`, `robust`, `robot` or `paper`."""
     robot: Annotated[str | None, _setting("robot")] = None
-    """A robot under robots/."""
+    """A shipped robot, or a robot's folder."""
     motion: Annotated[str | None, _setting("motion")] = None
     """Motions as `fmpjax train` takes them."""
     frames: Annotated[str | None, default("all")] = None
     """Source rows first:last of the motion, 0-based, both included; of several motions with commas between them."""
     command: Annotated[str | None, default("none")] = None
-    """The command of the runs, with which heading axes go."""
+    """The command of the runs; commands imply heading axes."""
     again: bool = False
-    """Train also where the cache has it."""
+    """Train again even if the cache has it."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Any other setting as section.field=value; `smp.network=published` is the published network."""
 
@@ -102,7 +102,9 @@ class Pretrain:
         trainer = Trainer(config, runs.load_motion(config))
         folder = runs.pretraining.folder_of(trainer)
         if folder is None:
-            raise UserError("there is no cache folder to keep it in: expected a home, or XDG_CACHE_HOME")
+            raise UserError(
+                "there is no cache folder for the pretrained model: expected a home folder, or one in XDG_CACHE_HOME"
+            )
         runs.pretraining.pretrain(trainer, folder, Progress(), again=self.again)
         for name in ("metrics.csv", "curves.png", "settings.json"):
             print(f"in the cache: {folder / name}")
@@ -113,18 +115,18 @@ class Train:
     """Train a policy from a demonstration."""
 
     method: Annotated[str | None, _setting("method")] = None
-    """Motion prior; `fmpjax list` shows all of them. `add` and `tracking` bring the command `phase` with them."""
+    """Motion prior; `fmpjax list` shows all of them. `add` and `tracking` also set the command `phase`."""
     reset: Annotated[str | None, _setting("env.reset")] = None
     """`dataset` (a demonstration state) or `fixed` (the default pose)."""
     preset: Annotated[str | None, default("laptop on a CPU, paper on an accelerator")] = None
     """`smoke`, `laptop`, `robust`, `robot` or `paper`; `fmpjax list` says what each is for."""
     robot: Annotated[str | None, _setting("robot")] = None
-    """A robot under robots/."""
+    """A shipped robot, or a robot's folder."""
     motion: Annotated[str | None, _setting("motion")] = None
     """A bundled motion's name, a file, a folder of files or an address (https://, hf://); several with weights as
     NAME[:WEIGHT],NAME[:WEIGHT]."""
     command: Annotated[str | None, default("none, or the run's own with --resume")] = None
-    """What the policy is told: `none`, `velocity` (by default of the motions `gaits`), `phase`,
+    """What the policy is told: `none`, `velocity` (with the motions `gaits` by default), `phase`,
     or `motion` (one of several); docs/steering.md."""
     accept_license: bool = False
     """Accept the license of a Hugging Face data set without a question."""
@@ -260,7 +262,7 @@ class Train:
             refused = error
         # The others wait here for the folders, and no longer than for a first process that has given up.
         if not sharding.agree(refused is None):
-            raise refused or UserError("the first process was refused, and says why")
+            raise refused or UserError("the first process stopped with an error: see its message")
         return group or self._resumed()
 
     def _created(self, devices: int | None):

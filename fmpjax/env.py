@@ -87,7 +87,7 @@ class Steps(NamedTuple):
 
     observation: Any  # [T, N, O] before the action; `Seen` with disturbances
     next_observation: jax.Array  # [T, N, O] after it, before any reset: the true one, with disturbances the critic's
-    action: jax.Array  # [T, N, J] normalised
+    action: jax.Array  # [T, N, J] normalized
     extras: dict[str, jax.Array]  # what the policy said of the action, each [T, N, ...]
     fell: jax.Array  # [T, N] bool
     timed_out: jax.Array  # [T, N] bool; a fall on the same step is a fall
@@ -112,7 +112,7 @@ def _rows_before(config: Config) -> int:
 
 
 class Env:
-    """Environments of one robot and its demonstrations; its methods are pure."""
+    """Parallel environments of one robot with its demonstrations. All methods are pure functions."""
 
     def __init__(self, robot: Robot, motion: MotionClip | MotionLibrary, config: Config, backend: physics.Physics):
         self.robot, self.config, self.physics = robot, config.env, backend
@@ -276,7 +276,7 @@ class Env:
         return self.start_at(self.reset_rows(key, self.config.count), jax.random.fold_in(key, 2))
 
     def rollout(self, state: EnvState, policy: ActionRule, key: jax.Array, steps: int) -> tuple[EnvState, Steps]:
-        """``steps`` control steps under a policy; falls and time-outs reset at once."""
+        """Play ``steps`` control steps under a policy; environments reset at once after a fall or a time-out."""
         count = len(state.age)
         before = self.clip_rows + 1  # rows ahead of the frames before the rollout
         during = before + count * self.horizon  # rows ahead of the rollout's own frames
@@ -316,11 +316,11 @@ class Env:
         return self._grow_cap(new_state, record), record
 
     def step(self, now: Moment, action: jax.Array, drawn: Drawn, cap: jax.Array) -> tuple[Moment, Steps]:
-        """One control step, after which episodes that are over begin again.
+        """One control step; environments whose episode is over reset.
 
         Args:
           now: the environments before the step.
-          action: ``[N, J]`` normalised.
+          action: ``[N, J]`` normalized.
           drawn: what the step needs beside the action.
           cap: scalar, steps at which an episode times out.
 
@@ -383,7 +383,7 @@ class Env:
         return jax.vmap(lambda key: command.draw(jax.random.fold_in(key, 3), (count,)))(keys)
 
     def advance(self, sim: physics.PhysicsState, action: jax.Array, disturbed: Any = (), drawn: Any = ()) -> Reached:
-        """The physics of one control step under normalised actions ``[N, J]``, whatever the episodes.
+        """The physics of one control step under normalized actions ``[N, J]``, whatever the episodes.
 
         With disturbances it takes their state and random numbers, too.
         """

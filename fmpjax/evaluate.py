@@ -17,7 +17,7 @@ from fmpjax.ppo import PPOState
 from fmpjax.trainer import Trainer
 
 # The definitions of the figures, beside those in `metrics`.
-DETAILED = 64  # episodes whose late speed, joints and feet are analysed [P]
+DETAILED = 64  # episodes whose late speed, joints and feet are analyzed [P]
 WINDOWS = 512  # windows at most on either side of the Sinkhorn discrepancy [D]
 CONTACT_HEIGHT = 0.01  # m, a foot is in contact where a sole point is lower [D]
 LEAST_SPEED = 0.1  # m/s, to which an error in speed is relative at least [D]
@@ -254,9 +254,9 @@ class Evaluator:
         expert = library.mean(
             [metrics.expert_ranges(clip.qpos[:, 7:], robot.sagittal_joints, rate=rate) for clip in library.clips]
         )
-        excursion = metrics.summarise(metrics.excursion(ranges, expert))
+        excursion = metrics.summarize(metrics.excursion(ranges, expert))
         feet, contact = self._feet(jnp.asarray(played.qpos[:, detail]))
-        late = metrics.summarise(speed)
+        late = metrics.summarize(speed)
         own_speed = [planar_speed(clip) for clip in library.clips]
         own_turn = np.array([turning(clip) for clip in library.clips])
         turns = abs(own_turn[played.clip[detail]]) > metrics.TURNS
@@ -268,15 +268,15 @@ class Evaluator:
             late_speed=late.mean,
             late_n=late.n,
             late_deviation=float(np.nanstd(speed)) if late.n else float("nan"),
-            path_speed=metrics.summarise(path_speed).mean,
-            turn=metrics.summarise(turn).mean,
+            path_speed=metrics.summarize(path_speed).mean,
+            turn=metrics.summarize(turn).mean,
             excursion=excursion.mean,
             excursion_n=excursion.n,
-            amplitude_mae=metrics.summarise(metrics.amplitude_mae(ranges, expert)).mean,
+            amplitude_mae=metrics.summarize(metrics.amplitude_mae(ranges, expert)).mean,
             discrepancy=self._discrepancy(played, detail),
-            contact_foot_speed=metrics.summarise(metrics.contact_foot_speed(feet, contact, length, rate=rate)).mean,
-            imbalance=metrics.summarise(metrics.left_right_imbalance(ranges)).mean,
-            displacement=metrics.summarise(displacement).mean,
+            contact_foot_speed=metrics.summarize(metrics.contact_foot_speed(feet, contact, length, rate=rate)).mean,
+            imbalance=metrics.summarize(metrics.left_right_imbalance(ranges)).mean,
+            displacement=metrics.summarize(displacement).mean,
             demonstration_speed=float(library.mean(own_speed)),
             demonstration_turn=float(library.mean(own_turn)),
             demonstration_turning=float(library.mean(abs(own_turn))),
@@ -296,7 +296,7 @@ class Evaluator:
         shares = []
         for i, clip in enumerate(clips):
             mine = played.clip == i
-            late = metrics.summarise(speed[mine[: len(speed)]])
+            late = metrics.summarize(speed[mine[: len(speed)]])
             falls = int(played.fell[mine].sum())
             shares.append(Share(clip.name, int(mine.sum()), falls, late.mean, late.n, own_speed[i]))
         return tuple(shares)
@@ -310,7 +310,7 @@ class Evaluator:
             servo = {"stiffness": robot.stiffness, "damping": robot.damping, "effort": robot.effort}
             found["action_rate"] = metrics.action_rate(played.targets, length, rate=rate)
             found["power"] = metrics.power(played.targets, angle, velocity, length, **servo)
-        means = {name: metrics.summarise(values).mean for name, values in found.items()}
+        means = {name: metrics.summarize(values).mean for name, values in found.items()}
         return {"action_rate": np.nan, "power": np.nan} | means
 
     def _feet(self, qpos: jax.Array) -> tuple[np.ndarray, np.ndarray]:

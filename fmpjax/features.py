@@ -192,7 +192,7 @@ def _observation(robot: Robot, p: _Parts, form: str) -> jax.Array:
 def prior_window(
     robot: Robot, qpos: Float[Floats, "*batch H q"], qvel: Float[Floats, "*batch H v"]
 ) -> Float[jax.Array, "*batch D"]:
-    """The prior's window before normalisation, ``[..., H * 239]`` for the G1, oldest frame first.
+    """The prior's window before normalization, ``[..., H * 239]`` for the G1, oldest frame first.
 
     A frame is root position (m; x and y relative to the newest frame, z absolute), root rotation 6D, joint rotations
     6D, key points less that frame's root (m), root velocity (m/s), root angular velocity (rad/s), joint velocities

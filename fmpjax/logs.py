@@ -55,7 +55,9 @@ class Mirror:
         try:
             self._run: Any = _opened(name, run, dict(settings))
         except Exception as error:  # each logger has errors of its own
-            raise UserError(f"logger {name!r} cannot start ({error}): expected one that works, or none") from error
+            raise UserError(
+                f"logger {name!r} cannot start ({error}): expected a working logger, or no --logger"
+            ) from error
 
     def write(self, row: Mapping[str, Any]) -> None:
         """Log a row of the CSV file; its step is the number of transitions."""

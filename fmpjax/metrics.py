@@ -3,7 +3,7 @@
 Everything is a pure function on NumPy arrays, computed in float64. ``T`` recorded steps, ``N`` environments; the state
 after step ``k`` is in row ``k``, at time ``(k + 1) / rate``. ``length [N]``, 1 to T, counts the rows of the first
 episode; later rows are never read. The metrics return one value per episode, NaN where an episode does not contribute;
-`summarise` makes the number to report and how many episodes stand behind it.
+`summarize` makes the number to report and how many episodes stand behind it.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ class Summary:
     n: int
 
 
-def summarise(per_episode: np.ndarray) -> Summary:
+def summarize(per_episode: np.ndarray) -> Summary:
     """Mean and number of the finite values of ``per_episode [N]``."""
     finite = np.isfinite(per_episode)
     return Summary(float(_mean(np.asarray(per_episode, np.float64), axis=0)), int(finite.sum()))

@@ -17,7 +17,7 @@ class Offender(NamedTuple):
 
     qpos: jax.Array  # [7 + J]
     qvel: jax.Array  # [6 + J]
-    action: jax.Array  # [J] normalised
+    action: jax.Array  # [J] normalized
 
 
 def offender(sim: PhysicsState, action: jax.Array, finite: jax.Array, before: Offender) -> Offender:

@@ -36,7 +36,7 @@ class Policy(NamedTuple):
     biases: tuple[np.ndarray, ...]  # [out]
     mean: np.ndarray  # [O], of the observations in training
     deviation: np.ndarray  # [O]
-    clip: float  # of normalised observations
+    clip: float  # of normalized observations
     center: np.ndarray  # [J] rad, the targets of action zero
     scale: np.ndarray  # [J] rad, a unit of action
     low: np.ndarray  # [J] rad, of the targets
@@ -58,7 +58,7 @@ class Policy(NamedTuple):
         if length != self.mean.shape:
             raise UserError(
                 f"the observation has {length[0] if length else 'no'} numbers: expected {len(self.mean)}, "
-                f"as the {self.observation!r} observation of this policy has"
+                f"for the observation {self.observation!r} of this policy"
             )
         x = np.clip((observation - self.mean) / self.deviation, -self.clip, self.clip)
         for kernel, bias in zip(self.kernels[:-1], self.biases[:-1], strict=True):

@@ -57,7 +57,7 @@ class Robot:
     fall_ends: np.ndarray  # [C, 2, 3] m, capsule axis ends in the body; equal for a sphere
     fall_radius: np.ndarray  # [C] m
     sole_body: np.ndarray  # [P]
-    sole_point: np.ndarray  # [P, 3] m, centre of the sphere, or of an end of the capsule, in the body
+    sole_point: np.ndarray  # [P, 3] m, center of the sphere, or of an end of the capsule, in the body
     sole_radius: np.ndarray  # [P] m
     feet: np.ndarray  # [2] bodies of the left and the right sole points
     sagittal_joints: np.ndarray  # [6] indices: left hip, knee, ankle, then right
@@ -105,7 +105,7 @@ def available() -> list[str]:
 
 
 def load(name: str) -> Robot:
-    """Load a shipped robot by its folder's name, or another one by the path of its folder.
+    """Load a shipped robot by its folder's name, or any robot by the path of its folder.
 
     Raises:
       UserError: there is no such robot, or its files are not as docs/robots.md says.

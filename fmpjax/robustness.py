@@ -214,7 +214,7 @@ def _cell(trainer: Trainer, case: Case, qpos: np.ndarray, length: np.ndarray, fe
         [metrics.expert_ranges(clip.qpos[:, 7:], robot.sagittal_joints, rate=rate) for clip in trainer.library.clips]
     )
     ranges = metrics.window_ranges(qpos[..., 7:], length, robot.sagittal_joints, rate=rate)
-    speed, excursion = metrics.summarise(speeds), metrics.summarise(metrics.excursion(ranges, expert))
+    speed, excursion = metrics.summarize(speeds), metrics.summarize(metrics.excursion(ranges, expert))
     return Cell(
         disturbance=case.disturbance,
         size=case.size,

@@ -57,7 +57,7 @@ def connect(coordinator: str | None, processes: int | None, process: int | None)
         jax.distributed.initialize(coordinator, processes, process)
     except (ValueError, RuntimeError) as error:
         raise UserError(
-            f"cannot join a distributed run ({str(error).splitlines()[0]}): expected to be started by SLURM or "
+            f"cannot join a distributed run ({str(error).splitlines()[0]}): expected a start by SLURM or "
             "another scheduler that JAX knows, or --coordinator HOST:PORT, --processes and --process"
         ) from None
     # Processes that read kept programs were seen to wait for each other for good: each compiles for itself.

@@ -99,7 +99,7 @@ def _refusing() -> Generator[None]:
         sys.exit(130)
     except Exception as error:
         if out_of_memory(error):
-            _refuse("out of memory: fewer --episodes, or a smaller env.count or evaluation_episodes, need less")
+            _refuse("out of memory: expected fewer --episodes, or a smaller env.count or evaluation_episodes")
         raise
 
 

@@ -80,7 +80,7 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 256, each: int
     """
     config, library = trainer.config.command, trainer.env.library
     if config.kind != "velocity":
-        raise UserError(f"the run's command.kind is {config.kind!r}: expected 'velocity', whose grid is tried")
+        raise UserError(f"the run's command.kind is {config.kind!r}: expected 'velocity'")
     rng, rate = np.random.default_rng(seed), trainer.config.control_rate
     low, high = velocity.extent(config, library)
     grid = _grid(low, high)

@@ -188,7 +188,7 @@ def _check(clip: MotionClip, robot: robots.Robot, config: Config) -> None:
         raise UserError(f"motion {clip.name} is of robot {clip.robot!r}: expected {robot.name!r}")
     if clip.duration < metrics.WINDOW:
         raise UserError(
-            f"motion {clip.name} lasts {clip.duration:.2f} s: expected at least {metrics.WINDOW:g} s, the window in "
+            f"motion {clip.name} lasts {clip.duration:.2f} s: expected at least {metrics.WINDOW:g} s, the window over "
             "which ranges of its joints are taken"
         )
     if len(clip) <= config.features.history:

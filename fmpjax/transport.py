@@ -143,7 +143,7 @@ def discrepancy(
 
 
 class ScoreFunction(NamedTuple):
-    """Transport reference score S_B of one source bank, and what it is made of."""
+    """The transport score S_B of one source bank: higher where the expert is and the source is not."""
 
     source_bank: jax.Array  # [n, d]
     expert_bank: jax.Array  # [m, d]
@@ -189,10 +189,17 @@ def fit_score(
     threshold: float = 1e-6,
     max_iterations: int = 2000,
 ) -> ScoreFunction:
-    """Transport reference score of ``source_bank [n, d]`` against ``expert_bank [m, d]``.
+    """Fit the transport score between two sets of samples, from a source toward an expert.
 
     Args:
+      source_bank: samples ``[n, d]`` to improve, such as windows of a policy.
+      expert_bank: samples ``[m, d]`` of the target.
       epsilon: entropy coefficient; by default a tenth of the median cross cost, at least 1e-3 / d.
+      threshold: marginal error (L1) at which the solver stops.
+      max_iterations: of the solver, at most.
+
+    Returns:
+      The score, its gradient and its matching probabilities as functions of any points ``[q, d]``.
 
     Examples:
       >>> import jax.numpy as jnp

@@ -98,7 +98,7 @@ def test_train_takes_a_configuration_and_changes_and_resumes(trained):
         ({"config": fmpjax.preset("smoke"), "preset": "paper"}, "preset is 'paper': expected a Config or the name of"),
         (
             {"config": fmpjax.preset("smoke"), "command": "velocity"},
-            "command goes with a preset: of a Config",
+            "command and a Config were given",
         ),
         ({"command": "speed"}, "command is 'speed': expected one of none, velocity, phase"),
         ({"method": "fpm"}, "fpm"),

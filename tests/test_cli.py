@@ -266,5 +266,5 @@ def test_a_device_that_is_not_there(tmp_path):
         command, env=os.environ | {"JAX_PLATFORMS": "cuda"}, capture_output=True, text=True, timeout=300, check=False
     )
     assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].startswith("fmpjax: JAX_PLATFORMS is 'cuda', and no such device is there")
+    assert done.stderr.splitlines()[-1].startswith("fmpjax: JAX_PLATFORMS is 'cuda', but JAX finds no such device")
     assert not (tmp_path / "run").exists()

@@ -49,7 +49,7 @@ def test_late_speed_excludes_episodes_that_end_early():
     position[:, :, 0] = 0.02 * np.arange(500)[:, None]
     speed = metrics.late_speed(position, np.array([249, 250, 251]), np.zeros(3))
     np.testing.assert_allclose(speed, [np.nan, np.nan, 1.0])
-    assert metrics.summarise(speed) == metrics.Summary(pytest.approx(1.0), 1)
+    assert metrics.summarize(speed) == metrics.Summary(pytest.approx(1.0), 1)
 
 
 def test_late_speed_of_a_short_record_is_excluded():
@@ -217,11 +217,11 @@ def test_episodes_without_a_window_are_excluded_and_counted():
     q = rng.normal(size=(150, 3, 7))
     q[np.arange(150)[:, None] >= length] = np.nan
     ranges = metrics.window_ranges(q, length, SAGITTAL)
-    assert metrics.summarise(metrics.excursion(ranges, EXPERT)).n == 1
-    assert metrics.summarise(metrics.amplitude_mae(ranges, EXPERT)).n == 2
-    assert metrics.summarise(metrics.left_right_imbalance(ranges)).n == 2
+    assert metrics.summarize(metrics.excursion(ranges, EXPERT)).n == 1
+    assert metrics.summarize(metrics.amplitude_mae(ranges, EXPERT)).n == 2
+    assert metrics.summarize(metrics.left_right_imbalance(ranges)).n == 2
     for metric in (metrics.excursion(ranges, EXPERT), metrics.amplitude_mae(ranges, EXPERT)):
-        assert np.isfinite(metrics.summarise(metric).mean)
+        assert np.isfinite(metrics.summarize(metric).mean)
     # No window fits at all.
     ranges = metrics.window_ranges(q[:40], np.minimum(length, 40), SAGITTAL)
     for metric in (
@@ -229,7 +229,7 @@ def test_episodes_without_a_window_are_excluded_and_counted():
         metrics.amplitude_mae(ranges, EXPERT),
         metrics.left_right_imbalance(ranges),
     ):
-        summary = metrics.summarise(metric)
+        summary = metrics.summarize(metric)
         assert np.isnan(summary.mean) and summary.n == 0
 
 
@@ -239,8 +239,8 @@ def test_an_episode_that_ends_in_a_broken_state_does_not_spoil_the_mean():
     position[:, :, 0] = 0.01 * np.arange(300)[:, None]
     position[299, 0] = np.inf
     length, heading = np.array([300, 300]), np.zeros(2)
-    assert metrics.summarise(metrics.late_speed(position, length, heading)) == metrics.Summary(pytest.approx(0.5), 1)
-    displacement = metrics.summarise(metrics.forward_displacement(position, length, heading))
+    assert metrics.summarize(metrics.late_speed(position, length, heading)) == metrics.Summary(pytest.approx(0.5), 1)
+    displacement = metrics.summarize(metrics.forward_displacement(position, length, heading))
     assert displacement == metrics.Summary(pytest.approx(2.99), 1)
 
 

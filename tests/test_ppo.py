@@ -269,7 +269,7 @@ def random_batch(ppo, state, seed=0):
     return batch_of(ppo, state, keys[1], probe(observation, YES, reward=reward))
 
 
-def test_advantages_are_normalised_and_clipped():
+def test_advantages_are_normalized_and_clipped():
     """At ratio one the surrogate is minus the mean gain, which is zero unless outliers are clipped."""
     ppo, state, update = whole_batch()
     batch = random_batch(ppo, state)
@@ -324,7 +324,7 @@ def test_bound_penalty_pulls_only_beyond_one():
             assert float(bias[0]) * value < 0 and norms[0] > 2 * norms[1]
 
 
-# --- rates, deviations, normaliser -----------------------------------------------------------------------------------
+# --- rates, deviations, normalizer -----------------------------------------------------------------------------------
 
 
 def test_rate_follows_the_divergence():
@@ -365,7 +365,7 @@ def test_deviation(learned):
         np.testing.assert_array_equal(after, deviation)
 
 
-def test_normaliser_starts_from_the_demonstration_where_asked():
+def test_normalizer_starts_from_the_demonstration_where_asked():
     observations = 5.0 + 2.0 * jax.random.normal(jax.random.PRNGKey(0), (300, 3))
     observations = observations.at[:, 2].set(7.0)
     for from_clip in (False, True):
@@ -382,7 +382,7 @@ def test_normaliser_starts_from_the_demonstration_where_asked():
             assert int(statistics.count.lo) == 0
 
 
-def test_normaliser_is_the_plain_mean_and_deviation_without_a_cap():
+def test_normalizer_is_the_plain_mean_and_deviation_without_a_cap():
     ppo = PPO(2, 1, PROBE)
     parts = [i + (1.0 + i) * jax.random.normal(jax.random.PRNGKey(i), (32, 4, 2)) for i in range(4)]
     statistics = ppo.init(jax.random.PRNGKey(0)).normalizer
@@ -394,7 +394,7 @@ def test_normaliser_is_the_plain_mean_and_deviation_without_a_cap():
     assert int(statistics.count.lo) == len(seen)
 
 
-def test_capped_normaliser_forgets():
+def test_capped_normalizer_forgets():
     """Counts are held at the cap, so a batch of B among C moves the mean by B / (C + B) of its distance."""
     cap, size = 100, 64
     ppo = PPO(1, 1, dataclasses.replace(PROBE, normalizer_count=cap))
@@ -414,7 +414,7 @@ def test_capped_normaliser_forgets():
         np.testing.assert_allclose(statistics.std, math.sqrt(variance), rtol=1e-3)
 
 
-def test_normaliser_moves_only_at_the_end_of_an_update():
+def test_normalizer_moves_only_at_the_end_of_an_update():
     ppo, state, update = whole_batch()
     batch = random_batch(ppo, state)
     batch = batch._replace(observation=3.0 + 2.0 * batch.observation)
@@ -427,7 +427,7 @@ def test_normaliser_moves_only_at_the_end_of_an_update():
     assert abs(float(moved - metrics["value"])) > 1e-4
 
 
-def test_normalised_observations_are_clipped():
+def test_normalized_observations_are_clipped():
     ppo, state, update = whole_batch()
     far = ppo.value(state, jnp.array([[10.0], [1e6]]))
     np.testing.assert_array_equal(far[0], far[1])
@@ -467,7 +467,7 @@ def test_a_rollout_of_nonsense_changes_nothing_and_is_counted(optimizer):
     ppo, state, update = make(optimizer=optimizer)
     batch = random_batch(ppo, state)
     new, metrics = update(state, batch._replace(reward=batch.reward.at[2, 3].set(jnp.nan)), jax.random.PRNGKey(0))
-    # Normalised advantages carry it into every sample of the actor; plain SGD's critic loses single minibatches.
+    # Normalized advantages carry it into every sample of the actor; plain SGD's critic loses single minibatches.
     assert same((new.actor, new.actor_optimizer), (state.actor, state.actor_optimizer))
     minibatches = 4 * (STEPS // 2)
     if optimizer == "adam":

@@ -269,7 +269,7 @@ def test_sigterm_saves_and_ends_well(tmp_path):
         if process.poll() is None:
             process.kill()
     assert process.returncode == 0, said
-    assert "stopping after the iterations in hand" in said and "Continue with --resume" in said
+    assert "stopping after the current call of the program" in said and "Continue with --resume" in said
     saved = Checkpoints(folder).latest()
     assert saved == int(rows(folder)[-1]["iteration"]) >= 4
 

@@ -30,9 +30,7 @@ def make(robot: Robot, library: MotionLibrary, frames: jax.Array, stride: int) -
       UserError: there are several demonstrations.
     """
     if len(library.clips) > 1:
-        raise UserError(
-            f"command.kind is 'phase' and the run has {len(library.clips)} motions: expected one, whose time is told"
-        )
+        raise UserError(f"command.kind is 'phase' and the run has {len(library.clips)} motions: expected one")
     last, layout = len(library.qpos) - 1, FrameLayout.of(robot)
     table = jnp.asarray(frames)
 

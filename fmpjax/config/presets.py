@@ -192,7 +192,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
 }
 DESCRIPTIONS = {
-    "smoke": "the whole path in a minute; learns nothing",
+    "smoke": "every step once, in a minute; learns nothing",
     "laptop": "walks after about a quarter of an hour on two cores",
     "robust": "`laptop` with disturbances, and only what a robot senses; three quarters of an hour",
     "robot": "`robust`, and steered by commanded velocities: for a real robot",

@@ -26,7 +26,7 @@ def check_widths(policy: Policy, terms: dict[str, int]) -> None:
         if width != wanted:
             raise UserError(
                 f"the policy's {name} has {width} numbers: expected {wanted}, "
-                f"as {joints} joints and the {policy.observation!r} observation make it"
+                f"for {joints} joints and the observation {policy.observation!r}"
             )
     for name, value in policy._asdict().items():
         arrays = value if name in ("kernels", "biases") else [value] if isinstance(value, np.ndarray) else []

@@ -40,7 +40,7 @@ def stock(policy: Policy, robot: Robot, origin: Origin) -> str:
     """
     terms = features.observation_terms(robot, policy.observation)
     if "velocity_commands" in terms and origin.commands is None:
-        raise UserError("the policy takes commands of no known range: expected lin_vel_x, lin_vel_y and ang_vel_z")
+        raise UserError("the policy takes unknown commands: expected lin_vel_x, lin_vel_y and ang_vel_z")
     steps = features.observation_history(policy.observation)
     commands = {name: list(span) for name, span in (origin.commands or {}).items()}
     action = {

@@ -78,7 +78,7 @@ def measure(
     if config.transitions_per_iteration < targets:
         raise UserError(
             f"the first rollout has {config.transitions_per_iteration} windows: expected at least {targets}, "
-            "one a target"
+            "one per target"
         )
     updates = {
         fraction: jax.jit(_prior_at(trainer, fraction).update)
@@ -288,7 +288,7 @@ def main(
       seed: of everything random in the first draw; the next has the next seed.
       draws: first rollouts, each with a policy, starts and banks of its own.
       entropies: further entropies over the median cost to match at, beside the preset's.
-      smoke: the whole path, small.
+      smoke: a small test run.
     """
     from fmpjax import runs
 

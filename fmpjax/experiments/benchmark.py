@@ -114,7 +114,7 @@ def plan(specification: Specification, motions: Sequence[str]) -> list[Cell]:
     from fmpjax import runs
 
     if not motions:
-        raise UserError("--only leaves out the default motions: expected a --motion at least")
+        raise UserError("--only leaves out the default motions: expected at least one --motion")
     named: dict[str, str] = {}
     for motion in motions:
         name = library.title(motion)

@@ -137,7 +137,7 @@ def main(run: Path, walking: Path, out: Path, updates: Updates = None, smoke: bo
       walking: folder of a run of the same demonstration whose best policy walks.
       out: folder for generalization.json, .csv and .png.
       updates: of each prior.
-      smoke: the whole path, small; the figures mean nothing.
+      smoke: a small test run; its figures mean nothing.
       seed: of everything random.
     """
     size = offline.size(updates, smoke)

@@ -140,7 +140,7 @@ def main(run: Path, walking: Path, out: Path, updates: Updates = None, smoke: bo
       walking: folder of a run of the same demonstration whose best policy walks.
       out: folder for static_teacher.json, .csv and .png.
       updates: of either.
-      smoke: the whole path, small; the figures mean nothing.
+      smoke: a small test run; its figures mean nothing.
       seed: of everything random.
     """
     size = offline.size(updates, smoke)

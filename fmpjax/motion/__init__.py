@@ -1,4 +1,4 @@
-"""Demonstrations: reading, resampling, writing, and a synthesised walk (`fmpjax.motion.gait`)."""
+"""Demonstrations: reading, resampling, writing, and a synthesized walk (`fmpjax.motion.gait`)."""
 
 from fmpjax.motion.clip import MotionClip, resample, velocities
 from fmpjax.motion.formats import bundled, folders, load, save

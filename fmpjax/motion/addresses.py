@@ -91,8 +91,8 @@ def listed(address: str, suffixes: Sequence[str]) -> list[str] | None:
         names = system.glob(path) if pattern else system.ls(path, detail=False)
     chosen = [f"hf://{name}" for name in sorted(names) if Path(name).suffix in suffixes]
     if not chosen:
-        what = "no motion file fits the pattern" if pattern else "no motion files are in the folder"
-        raise UserError(f"{what} {address}: expected some that end in {', '.join(suffixes)}")
+        what = "no motion file matches the pattern" if pattern else "no motion files are in the folder"
+        raise UserError(f"{what} {address}: expected files that end in {', '.join(suffixes)}")
     return chosen
 
 
@@ -159,7 +159,7 @@ def check_license(address: str, *, accept: bool = False) -> None:
         _say(f"{sentence}, which is accepted")
     elif sys.stdin is None or not sys.stdin.isatty():
         raise UserError(
-            f"{sentence}, which is not accepted yet: expected --accept-license, or fmpjax.motion.accept_license "
+            f"{sentence}, which you have not accepted yet: expected --accept-license, or fmpjax.motion.accept_license "
             "in Python, or a terminal to ask"
         )
     else:

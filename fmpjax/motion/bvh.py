@@ -2,7 +2,7 @@
 
 A file has a ``HIERARCHY`` (joints with an ``OFFSET`` in their parent and ``CHANNELS`` in any order, ``End Site`` where
 a limb ends) and a ``MOTION`` (one line of channel values a frame). Axes and lengths are the file's own, usually y up
-and centimetres; angles are degrees. A joint turns by its rotation channels in the order written, each about an axis
+and centimeters; angles are degrees. A joint turns by its rotation channels in the order written, each about an axis
 that the ones before have turned. A position channel replaces the offset's component.
 """
 
@@ -116,7 +116,7 @@ def _hierarchy(file: Path, lines: list[str]) -> tuple[tuple, np.ndarray, np.ndar
                     f"{file}: line {line} names a joint {_shown(name)}, expected a name that no other joint has"
                 )
             if len(names) == MOST_JOINTS:
-                raise UserError(f"{file}: line {line} has the joint after {MOST_JOINTS}, expected no more")
+                raise UserError(f"{file}: line {line} has more than {MOST_JOINTS} joints, expected at most that many")
             inside.append(len(names))
             names.append(name)
             parent.append(joint)
@@ -129,7 +129,7 @@ def _hierarchy(file: Path, lines: list[str]) -> tuple[tuple, np.ndarray, np.ndar
         elif word == "}" and inside:
             missing = "OFFSET" if offset[joint] is None else "CHANNELS" if channels[joint] is None else None
             if missing:
-                raise UserError(f"{file}: line {line} ends joint {_shown(names[joint])}, expected its {missing} before")
+                raise UserError(f"{file}: line {line} ends joint {_shown(names[joint])}, expected its {missing} first")
             inside.pop()
         elif kind == "MOTION" and names and not inside:
             return tuple(names), np.array(parent), np.array(offset), tuple(channels)
@@ -144,7 +144,7 @@ def _words(file: Path, lines: list[str]) -> Iterator[tuple[str, int]]:
         for word in line.replace("{", " { ").replace("}", " } ").split():
             yield word, number
     yield "MOTION", len(lines) + 1
-    raise UserError(f"{file}: line {len(lines) + 1} is MOTION within a joint, expected the joint's end before")
+    raise UserError(f"{file}: line {len(lines) + 1} is MOTION within a joint, expected the end of the joint first")
 
 
 def _until_brace(file: Path, words: Iterator[tuple[str, int]], line: int) -> Iterator[str]:
@@ -194,7 +194,7 @@ def _motion(file: Path, lines: list[str], start: int, columns: int) -> tuple[flo
     for row, (number, line) in zip(values, rows, strict=True):
         cells = line.split()
         if len(cells) != columns:
-            raise UserError(f"{file}: line {number} has {len(cells)} values, expected {columns}, one a channel")
+            raise UserError(f"{file}: line {number} has {len(cells)} values, expected {columns}, one per channel")
         try:
             row[:] = list(map(float, cells))
         except ValueError:

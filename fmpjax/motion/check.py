@@ -195,14 +195,14 @@ def unsuited(robot: Robot, clip: MotionClip, *, axes: str, reset: str, seconds: 
     if clip.duration < seconds and np.abs(last[7:] - target[7:]).max() > CLOSED:
         said.append(
             f"the motion lasts {clip.duration:.1f} s and does not loop, and an evaluation lasts {seconds:g} s: "
-            "what the policy does after the motion's end is its own"
+            "it does not say what the policy should do after that"
         )
     if _assumed_rate(clip):
         ratio, stride = pace(robot, clip)
         if not SLOW < ratio < FAST:
             said.append(
-                f"strides of {stride:.2f} m are usually made {'faster' if ratio < 1 else 'slower'}, and the file names "
-                "no rate: is its rate another one (--fps)?"
+                f"strides of {stride:.2f} m are usually {'faster' if ratio < 1 else 'slower'}, and the file has no "
+                "rate: check it, and give it by --fps"
             )
     return said
 

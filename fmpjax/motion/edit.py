@@ -71,7 +71,7 @@ def loop_target(clip: MotionClip) -> np.ndarray:
 
 
 def looped(clip: MotionClip) -> MotionClip:
-    """The clip with its end bent towards its start: over the last `BLEND` s the gap is taken off, smoothly."""
+    """The clip with its end bent toward its start: over the last `BLEND` s the gap is taken off, smoothly."""
     target, last = loop_target(clip), clip.qpos[-1]
     time = np.arange(len(clip)) / clip.rate
     share = np.clip(1 - (clip.duration - time) / min(BLEND, clip.duration), 0, 1)[:, None]

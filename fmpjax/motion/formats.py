@@ -44,9 +44,9 @@ def load(
     without: str = "",
     degrees: bool = False,
 ) -> MotionClip:
-    """Load a motion and put it on the grid of ``rate``; the clip's `reading` says what the file was read as.
+    """Load a motion and resample it to ``rate``; the clip's `reading` says how the file was read.
 
-    A file that says that it loops is repeated until it lasts `LOOPED` s, unless ``frames`` takes a part of it.
+    A file that is marked as a loop is repeated until it lasts `LOOPED` s, unless ``frames`` selects a part of it.
 
     Args:
       path: a file of any format of `fmpjax.motion.readers`, its address (`fmpjax.motion.addresses`), or the name of a
@@ -54,9 +54,9 @@ def load(
       fps: rate of the source rows, Hz; replaces the file's own.
       frames: source rows to use, 0-based, both ends included: ``(2370, 2580)``, ``"2370:2580"``, ``"100:"``.
       rate: rate of the clip, Hz.
-      robot: name of the robot that the file must be for.
+      robot: name of the robot whose joints the file must have.
       quaternion: order of the root's quaternion, ``"wxyz"`` or ``"xyzw"``; replaces the format's.
-      without: words with commas between them; joints that have one in their name are not in the file and are zero.
+      without: words separated by commas; joints with one of them in their name are missing in the file and are zero.
       degrees: the file's joints are in degrees.
 
     Raises:

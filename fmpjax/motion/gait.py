@@ -164,9 +164,7 @@ def make(robot: Robot, command: Command, *, rate: float = 50.0, style: Style = O
         style's phases are out of order; the command is out of the legs' reach.
     """
     if not robot.gait:
-        raise UserError(
-            f"robot {robot.name!r} has no [gait] in its robot.toml, which says how it walks{_others(robot)}"
-        )
+        raise UserError(f"robot {robot.name!r} has no [gait] in its robot.toml, so it has no walk{_others(robot)}")
     _check(robot, command, rate, style)
     if style.named() and command.speed > 0 and not command.sideways:
         own = style.on(robot)
@@ -220,7 +218,7 @@ def _check(robot: Robot, command: Command, rate: float, style: Style) -> None:
         if not (0 < s.flat < s.heel_off < 0.5 < s.toe_off < s.highest_at < s.lowest_at < 1):
             raise UserError(
                 f"the style's phases are flat {s.flat}, heel_off {s.heel_off}, toe_off {s.toe_off}, highest_at "
-                f"{s.highest_at}, lowest_at {s.lowest_at}: expected growing numbers between 0 and 1, of which the "
+                f"{s.highest_at}, lowest_at {s.lowest_at}: expected increasing numbers between 0 and 1, of which the "
                 "first two are below 0.5"
             )
 

@@ -17,7 +17,7 @@ class OutOfReach(UserError):
 class Leg:
     """The six hinges between the root and one foot, solved by Newton's method.
 
-    ``joints [6]``: indices of the hinges, from the root. ``heel``, ``toe`` ``[3]``: centres of the sole's hindmost and
+    ``joints [6]``: indices of the hinges, from the root. ``heel``, ``toe`` ``[3]``: centers of the sole's hindmost and
     foremost spheres in the foot's body, m, y positive on either side; they have ``radius`` (m). ``half_width`` (m): of
     the sole.
 

@@ -137,7 +137,9 @@ def listed(names: str) -> str:
             continue
         for file in files:
             if "," in file:
-                raise UserError(f"motion file {file} has a comma in its name, which parts motions: expected none")
+                raise UserError(
+                    f"motion file {file} has a comma in its name: expected none, since commas separate motions"
+                )
         entries += [f"{file}:{weight / len(files):.6g}" for file in files]
     return ",".join(entries)
 
@@ -159,7 +161,7 @@ def _files(name: str) -> list[str] | None:
     if folder is not None:
         found = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
         if not found:
-            raise UserError(f"folder {folder} holds no motion files: expected some that end in {', '.join(SUFFIXES)}")
+            raise UserError(f"folder {folder} has no motion files: expected files that end in {', '.join(SUFFIXES)}")
         if folder == shipped and not Path(name).is_absolute():
             return [f"{name}/{path.stem}" for path in found]
         return list(map(str, found))
@@ -167,7 +169,7 @@ def _files(name: str) -> list[str] | None:
         return None
     matches = sorted(path for path in glob.glob(name, recursive=True) if os.path.isfile(path))
     if not matches:
-        raise UserError(f"no file fits the pattern {name!r}: expected motion files, such as 'clips/*.npz'")
+        raise UserError(f"no file matches the pattern {name!r}: expected motion files, such as 'clips/*.npz'")
     return matches
 
 

@@ -8,7 +8,7 @@ from fmpjax.robots import Robot
 
 
 def sole_points(robot: Robot, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World centres of the sole spheres ``[T, P, 3]`` and rotation matrices of their bodies ``[T, P, 3, 3]``.
+    """World centers of the sole spheres ``[T, P, 3]`` and rotation matrices of their bodies ``[T, P, 3, 3]``.
 
     All samples at once, which takes a tenth of the time of MuJoCo's kinematics sample by sample.
     """

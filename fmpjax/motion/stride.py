@@ -86,7 +86,7 @@ class Stride:
         self.swing_heading = BPoly.from_derivatives([s.toe_off, 1.0], [[0.0, 0.0, 0.0], [angle, 0.0, 0.0]])
 
     def _standing(self, side: int, phase: float) -> list[np.ndarray]:
-        """Position ``[3]`` of a foot that stands with its centre at the origin, and two derivatives by phase."""
+        """Position ``[3]`` of a foot that stands with its center at the origin, and two derivatives by phase."""
         h = 1e-4
         near = (phase + np.array([-h, 0.0, h])) % 1.0
         a, b, c = self._rolled(side, self.pitch(near), self.bank[side](near))
@@ -95,7 +95,7 @@ class Stride:
     def _rolled(self, side: int, pitch: np.ndarray, bank: np.ndarray) -> np.ndarray:
         """Position ``[N, 3]`` of the foot's body, in the frame where it stands, when the sole has rolled on its edges.
 
-        The edge that touches has a radius, so its centre moves on by radius times angle.
+        The edge that touches has a radius, so its center moves on by radius times angle.
         """
         leg, sign, zero = self.legs[side], 1 - 2 * side, np.zeros_like(pitch)
         x, y, z = (np.where(pitch[:, None] < 0, leg.heel, leg.toe) * [1.0, -sign, 1.0]).T
@@ -103,8 +103,8 @@ class Stride:
         # Written out, not by quaternions: second differences of this would show the rounding of more operations.
         up, over = np.sin(bank) * y + np.cos(bank) * z, np.cos(bank) * y - np.sin(bank) * z
         c, s = np.cos(pitch), np.sin(pitch)
-        centre = np.stack([x + leg.radius * pitch, y - leg.radius * bank, zero + leg.radius], axis=-1)
-        return centre - np.stack([c * x + s * up, over, c * up - s * x], axis=-1)
+        center = np.stack([x + leg.radius * pitch, y - leg.radius * bank, zero + leg.radius], axis=-1)
+        return center - np.stack([c * x + s * up, over, c * up - s * x], axis=-1)
 
     def place(self, phase: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """The walker's frame: its origin, world ``[..., 2]`` m, and its heading ``[...]`` rad; any phase ``[...]``."""
@@ -114,7 +114,7 @@ class Stride:
     def foot_poses(self, side: int, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World positions ``[N, 3]`` (m) and wxyz orientations ``[N, 4]`` of the left (0) or right (1) foot; any phase.
 
-        The left foot's centre lands beside the walker's frame of phase 0, the right one's of phase 1/2.
+        The left foot's center lands beside the walker's frame of phase 0, the right one's of phase 1/2.
         """
         s, sign = self.style, 1 - 2 * side
         strides, phase = np.divmod(phase - 0.5 * side, 1.0)

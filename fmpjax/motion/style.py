@@ -20,7 +20,7 @@ class Style:
     """How the walk looks; lengths m, angles rad, phases as fractions of a stride. None leaves it to the robot."""
 
     cadence: float | None = None  # steps/s; rounded so that half a stride is a whole number of samples
-    half_width: float | None = None  # of each foot's centre from the line of travel
+    half_width: float | None = None  # of each foot's center from the line of travel
     toe_out: float | None = None
     # Of the foot ahead as it lands and of the foot behind as it leaves, in steps aside; positive to the left.
     bank: float | None = None

@@ -25,7 +25,7 @@ def make(robot: Robot, config: PhysicsConfig, *, joint_friction: bool = False) -
         from fmpjax.physics.mjx import MjxPhysics
 
         if joint_friction:  # with it MJX was seen to leave MuJoCo C by a tenth of a radian in one control step
-            raise UserError("disturbance.joint_friction needs physics.backend=native: MJX does not agree with it there")
+            raise UserError("disturbance.joint_friction needs physics.backend=native: MJX gives other results")
         return MjxPhysics(robot, config)
     from fmpjax.physics.native import NativePhysics
 

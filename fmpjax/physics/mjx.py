@@ -64,7 +64,7 @@ class MjxPhysics:
 
             built = mjx.put_model(self.model, impl="warp", device=self._device)
         except NotImplementedError as error:
-            _refuse(f"the robot's model needs what Warp does not have ({error}): expected physics.impl 'jax'")
+            _refuse(f"the robot's model uses a feature that Warp lacks ({error}): expected physics.impl 'jax'")
         except (ImportError, RuntimeError) as error:
             _refuse(f"it is not installed ({error}): install fmpjax[warp]")
         except AssertionError:
@@ -85,7 +85,7 @@ class MjxPhysics:
         if traits is None:
             return PhysicsState(*self._step(*state, targets))
         if self.config.impl == "warp":
-            _refuse("there every robot has one model: expected physics.impl 'jax' with disturbances of robot or floor")
+            _refuse("all robots share one model: expected physics.impl 'jax' for disturbances of robot or floor")
         return PhysicsState(*self._step(*state, targets, traits.packed.astype(state.qpos.dtype)))
 
     @functools.cached_property

@@ -30,7 +30,7 @@ class Session:
         rates = {round(1.0 / player.simulation.policy.step_dt, 6): player.label for player in players}
         if len(rates) > 1:
             (a, first), (b, second), *_ = rates.items()
-            raise UserError(f"{first} acts at {a:g} Hz and {second} at {b:g} Hz: expected policies of one rate")
+            raise UserError(f"{first} acts at {a:g} Hz and {second} at {b:g} Hz: expected policies with the same rate")
         self.players = list(players)
         self.dt = players[0].simulation.policy.step_dt  # s, of control
         self.command = np.zeros(3)  # m/s forward and to the left, rad/s

@@ -73,7 +73,7 @@ class RunSource:
         self._reader = Reader(folder)
         names = self.names()
         if not names:
-            raise UserError(f"run {folder} has no checkpoint: expected one, train it first")
+            raise UserError(f"run {folder} has no checkpoint: train the run first")
         self.first = names[0] if name is None else name
         if self.first not in names:
             raise UserError(f"run {folder} has no policy {name!r}: expected one of {', '.join(names)}")

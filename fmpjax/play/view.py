@@ -81,7 +81,7 @@ class View:
         self._middle[:2] += share * off
 
     def _pull(self, i: int, body: int, point: np.ndarray, target: np.ndarray) -> None:
-        """Pull player ``i`` at a point of the page towards another one."""
+        """Pull player ``i`` at a point of the page toward another one."""
         shift = self._lanes[i] - self._middle
         with self._session.frozen():
             data, drag = self._session.players[i].simulation.data, self._session.players[i].drag

@@ -74,7 +74,7 @@ def check_pretrained(method: str) -> None:
     """Raise a `UserError` unless ``method`` learns something of the demonstration before any policy."""
     check(method)
     if method not in _PRETRAINED:
-        raise UserError(f"method {method!r} learns nothing before its policy: expected {', '.join(_PRETRAINED)}")
+        raise UserError(f"method {method!r} has no pretraining: expected {', '.join(_PRETRAINED)}")
 
 
 def check_potential(method: str) -> None:

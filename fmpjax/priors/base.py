@@ -75,7 +75,7 @@ class MotionPrior(NamedTuple):
     """A learned reward.
 
     ``init(key)``, ``update(state, rollout, key) -> (state, reward [T, N], metrics)``, ``score(state, features)``.
-    ``update`` owns its order: transport priors fit and then score, a discriminator scores and then fits.
+    ``update`` decides its own order: transport priors fit and then score, a discriminator scores and then fits.
     """
 
     init: Callable[[jax.Array], PriorState]

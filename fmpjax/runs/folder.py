@@ -69,9 +69,9 @@ def describe(config: Config) -> str:
 class Run:
     """A run folder.
 
-    ``config.json`` and ``provenance.json`` say what it is; ``demonstration.npz`` holds the clip as it was resampled,
-    ``demonstration-2.npz`` and so on further ones; ``metrics.csv`` and ``tensorboard/`` its course; ``checkpoints/``
-    and ``best/`` its state.
+    ``config.json`` has its settings, ``provenance.json`` its origin; ``demonstration.npz`` is the resampled clip, and
+    ``demonstration-2.npz`` and so on are further ones; ``metrics.csv`` and ``tensorboard/`` have the metrics;
+    ``checkpoints/`` and ``best/`` have its states.
     """
 
     def __init__(self, folder: str | Path):
@@ -122,7 +122,7 @@ class Run:
         return configuration.read(self.folder / "config.json")
 
     def extend(self, transitions: int) -> None:
-        """Give the run a larger budget; its evaluations are at shares of that from here on."""
+        """Give the run a larger budget, in transitions; further evaluations are at shares of the new budget."""
         longer = dataclasses.replace(self.config, transitions=transitions)
         write(self.folder / "config.json", configuration.to_json(longer))
         self._trainer = None
@@ -135,7 +135,7 @@ class Run:
         write(self.folder / "provenance.json", jsons.dumps(made))
 
     def provenance(self) -> dict[str, Any]:
-        """What ``provenance.json`` says.
+        """The contents of ``provenance.json``.
 
         Raises:
           UserError: it is missing or broken.
@@ -188,7 +188,7 @@ class Run:
         return motion.library.parse(config.motion)
 
     def policy(self, *, best: bool = True) -> tuple[Trainer, TrainState]:
-        """The run's parts and its best state, or its newest where no evaluation chose a best one."""
+        """The run's trainer and its best state, or its newest state if no evaluation selected a best one."""
         trainer = self.trainer()
         best = best and self.checkpoints.latest(best=True) is not None
         return trainer, self.checkpoints.restore(trainer.init(), best=best)

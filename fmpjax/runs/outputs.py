@@ -122,7 +122,7 @@ def _check_deployable(run: Run, option: str) -> None:
     """Refuse a run without a policy for other programs, or without the packages that ``option`` needs."""
     deploy.check_installed(option)
     if not (run.checkpoints.iterations() or run.checkpoints.iterations(best=True)):
-        raise UserError(f"run {run.folder} has no checkpoint: expected one, of which {option} takes the policy")
+        raise UserError(f"run {run.folder} has no checkpoint: {option} needs one, train the run first")
 
 
 def origin_of(run: Run) -> deploy.Origin:
@@ -150,7 +150,7 @@ def _measured(run: Run, name: str) -> dict[str, Any] | None:
     except ValueError:
         figures = None
     if not isinstance(figures, dict):
-        raise UserError(f"{path} is not as `fmpjax evaluate` writes it: expected JSON, an object of figures")
+        raise UserError(f"{path} is not a file of `fmpjax evaluate`: expected a JSON object of figures")
     return figures
 
 

@@ -120,7 +120,7 @@ def pretrained(
         except UserError as error:
             refused = error
     if not sharding.agree(refused is None):
-        raise refused or UserError("the first process was refused, and says why")
+        raise refused or UserError("the first process stopped with an error: see its message")
     learned = sharding.first(learned)
     # A compiled chunk is given its state's buffers to write into, so no two leaves may share one.
     return [state._replace(prior=jax.tree.map(jnp.copy, pretraining.put(state.prior, learned))) for state in states]

@@ -85,7 +85,7 @@ def shared_trainer(group: Sequence[Run]) -> Trainer:
             if key != "seed" and value != first[key]:
                 raise UserError(
                     f"run {run.folder} has {key} {value!r} and run {group[0].folder} {first[key]!r}: "
-                    "runs that train at once differ in their seeds alone"
+                    "runs that train together may differ only in their seeds"
                 )
     return group[0].trainer()
 

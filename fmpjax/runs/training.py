@@ -182,7 +182,7 @@ class StopSignals:
         if self.requested and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.requested = True
-        print("\nstopping after the iterations in hand, then saving ...", flush=True)
+        print("\nstopping after the current call of the program, then saving ...", flush=True)
 
     def __exit__(self, *exception):
         for number, handler in self._before.items():

@@ -66,7 +66,7 @@ def play(
       UserError: there is a course, and the policy takes no commands.
     """
     if course and "velocity_commands" not in sim.policy.terms:
-        raise UserError("there is a course, and the policy takes no commands: expected one that observes them")
+        raise UserError("the policy takes no commands: expected no course")
     course = course or ((seconds, (0.0, 0.0, 0.0)),)
     ends, commands = np.cumsum([leg for leg, _ in course]), np.array([command for _, command in course])
     random, played = np.random.default_rng(seed), []

@@ -180,11 +180,11 @@ def _check(path: str | Path, policy: Policy, shapes: tuple[Sequence[int], Sequen
             raise UserError(f"{path} observes {name!r}, which sim2sim does not know: expected {', '.join(TERMS)}")
     taken, given = map(list, shapes)
     if (taken, given) != ([1, size], [1, joints]):
-        raise UserError(f"{path} maps {taken} to {given}: its metadata tells of [1, {size}] to [1, {joints}]")
+        raise UserError(f"{path} maps {taken} to {given}: its metadata says [1, {size}] to [1, {joints}]")
     per_joint = ("center", "scale", "stiffness", "damping", "effort", "joint_limits", "joint_axes")
     for name, rows in ({name: getattr(policy, name) for name in per_joint} | policy.facts).items():
         if len(rows) != joints:
-            raise UserError(f"{path} has {len(rows)} of {name}: expected one per joint, {joints}")
+            raise UserError(f"{path} has {len(rows)} values of {name}: expected {joints}, one per joint")
     if len(policy.default_qpos) != 7 + joints:
         raise UserError(f"{path} has {len(policy.default_qpos)} numbers in default_qpos: expected {7 + joints}")
     if policy.commands is not None and policy.commands.shape != (2, 3):

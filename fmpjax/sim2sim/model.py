@@ -23,7 +23,7 @@ def check_servos(model: mujoco.MjModel, servos: dict[str, int | None], path: str
     for name, i in servos.items():
         gain, bias = (0, (0, 0)) if i is None else (model.actuator_gainprm[i, 0], model.actuator_biasprm[i])
         if not (gain > 0 and bias[1] == -gain and model.actuator_gear[i, 0] == 1):
-            raise UserError(f"{path} has no position servo on {name}: expected one per joint where it keeps its gains")
+            raise UserError(f"{path} has no position servo on {name}: expected one per joint with --gains model")
 
 
 def prepared(policy: Policy, path: str | Path, own_gains: bool) -> tuple[mujoco.MjModel, list[str]]:

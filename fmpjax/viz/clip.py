@@ -21,8 +21,8 @@ from fmpjax.viz import render
 PICTURES, COLUMNS = 20, 5  # of a contact sheet
 VIDEO_FPS = 50.0  # Hz, at most
 SIDES = ("left_", "right_")
-COLOURS = ("#2a6fb0", "#c8553d", "#3a8a6b")  # left, right, neither
-KIND_COLOURS = dict(zip(KINDS, ("#b8b8b8", "#9b6fb0", "#2a6fb0", "#3a8a6b", "#c8553d"), strict=True))
+COLORS = ("#2a6fb0", "#c8553d", "#3a8a6b")  # left, right, neither
+KIND_COLORS = dict(zip(KINDS, ("#b8b8b8", "#9b6fb0", "#2a6fb0", "#3a8a6b", "#c8553d"), strict=True))
 
 
 _NO_DISPLAY = "there is no display"
@@ -115,10 +115,10 @@ def plot(robot: Robot, clip: MotionClip, path: str | Path) -> Path:
     for panel, (name, joints) in zip(panels[1:].flat, groups.items(), strict=False):
         panel.set_title(f"{name.removesuffix('_joint').replace('_', ' ')}, rad", fontsize=9)
         for joint in joints:
-            colour = COLOURS[_side(robot.joint_names[joint])]
-            panel.plot(times, clip.qpos[:, 7 + joint], color=colour, linewidth=1)
+            color = COLORS[_side(robot.joint_names[joint])]
+            panel.plot(times, clip.qpos[:, 7 + joint], color=color, linewidth=1)
             for limit in (robot.joint_low[joint], robot.joint_high[joint]):
-                panel.axhline(limit, color=colour, linewidth=0.8, linestyle=":")
+                panel.axhline(limit, color=color, linewidth=0.8, linestyle=":")
     for panel in panels[1:].flat[len(groups) :]:
         panel.set_axis_off()
     for panel in panels[-1]:
@@ -152,8 +152,8 @@ def timeline(clip: MotionClip, found: list[Stretch], path: str | Path) -> Path:
         panel.set_ylabel(title, fontsize=9)
         panel.plot(times, values, color="black", linewidth=0.8)
         for stretch in found:
-            panel.axvspan(times[stretch.rows][0], times[stretch.rows][-1], color=KIND_COLOURS[stretch.kind], alpha=0.4)
-    handles = [Patch(color=colour, alpha=0.4, label=kind) for kind, colour in KIND_COLOURS.items()]
+            panel.axvspan(times[stretch.rows][0], times[stretch.rows][-1], color=KIND_COLORS[stretch.kind], alpha=0.4)
+    handles = [Patch(color=color, alpha=0.4, label=kind) for kind, color in KIND_COLORS.items()]
     speed.legend(handles=handles, ncols=len(handles), fontsize=8, loc="upper right")
     height.set_xlabel("s", fontsize=9)
     figure.suptitle(clip.name, fontsize=10)
@@ -172,14 +172,14 @@ def _root(panels: np.ndarray, robot: Robot, clip: MotionClip, times: np.ndarray)
     drawn = {"root height, m": clip.qpos[:, 2], "speed, m/s": np.linalg.norm(clip.qvel[:, :2], axis=1)}
     for panel, (title, values) in zip(panels, drawn.items(), strict=False):
         panel.set_title(title, fontsize=9)
-        panel.plot(times, values, color=COLOURS[2], linewidth=1)
+        panel.plot(times, values, color=COLORS[2], linewidth=1)
     feet, turn = panels[2:]
     feet.set_title("lowest point of each foot, m", fontsize=9)
-    for foot, colour in zip(robot.feet, COLOURS, strict=False):
-        feet.plot(times, height[:, robot.sole_body == foot].min(axis=1), color=colour, linewidth=1)
+    for foot, color in zip(robot.feet, COLORS, strict=False):
+        feet.plot(times, height[:, robot.sole_body == foot].min(axis=1), color=color, linewidth=1)
     feet.axhline(0, color="black", linewidth=0.8, linestyle=":")
     turn.set_title("turning speed, rad/s", fontsize=9)
-    turn.plot(times, np.linalg.norm(clip.qvel[:, 3:6], axis=1), color=COLOURS[2], linewidth=1)
+    turn.plot(times, np.linalg.norm(clip.qvel[:, 3:6], axis=1), color=COLORS[2], linewidth=1)
 
 
 def _side(joint: str) -> int:

@@ -18,7 +18,7 @@ from fmpjax.viz.picture import Picture
 _HERE = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa")  # what MuJoCo may draw through on this system
 _OFF = ("disable", "disabled", "off", "false", "0")
 _ANY = ("", "enable", "enabled", "on", "true", "1", "glfw", "glx")  # what MuJoCo knows beside, and what needs a window
-AZIMUTH, ELEVATION = 125.0, -10.0  # deg; the robot walks along +x, past the camera and a little towards it
+AZIMUTH, ELEVATION = 125.0, -10.0  # deg; the robot walks along +x, past the camera and a little toward it
 GHOST_RGBA = (0.20, 0.55, 0.95, 0.16)
 HIDDEN_GROUPS = slice(3, None)  # geoms that only collide or mark falls
 # A context that opens is not enough: without a driver the first use of it fails, and may take the process with it.

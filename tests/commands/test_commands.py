@@ -328,7 +328,7 @@ def test_a_folder_is_a_list_of_its_motions(tmp_path):
     assert len(gaits) > 20 and all(name.startswith("gaits/") for name in gaits)
     assert [library.title(name) for name in ("gaits/+0.40_-0.80", "/a/b.npz", "walk")] == ["+0.40_-0.80", "b", "walk"]
     (tmp_path / "none").mkdir()
-    with pytest.raises(UserError, match="none holds no motion files: expected some that end in .npz"):
+    with pytest.raises(UserError, match="none has no motion files: expected files that end in .npz"):
         library.listed(str(tmp_path / "none"))
 
 

@@ -232,7 +232,7 @@ def test_the_folder_that_is_written_is_named_or_in_the_run(monkeypatch, tmp_path
 
 def test_a_page_of_a_run_without_a_policy_is_refused(tmp_path):
     run = opened(tmp_path / "run")
-    with pytest.raises(UserError, match="run has no checkpoint: expected one, of which --web takes the policy"):
+    with pytest.raises(UserError, match="run has no checkpoint: --web needs one"):
         runs.web(run, tmp_path / "page")
     assert not (tmp_path / "page").exists()
 

@@ -56,7 +56,7 @@ def test_motions_of_ones_own_join_the_default_ones(tmp_path):
     mine = motion.save(motion.load("slow_walk"), tmp_path / "mine.npz")
     assert [cell.variant for cell in small("fmp", motions=("walk", str(mine)))] == ["walk", "mine"]
     for motions, said in (
-        ((), "--only leaves out the default motions: expected a --motion at least"),
+        ((), "--only leaves out the default motions: expected at least one --motion"),
         (("walk", str(tmp_path / "none.npz")), "none.npz"),
         (("mine.npz", str(mine)), "motions 'mine.npz' and '.*mine.npz' are both called 'mine': expected two names"),
     ):
@@ -118,7 +118,7 @@ def test_a_seed_that_another_command_has_trained_is_not_begun_again(tmp_path):
     run = tmp_path / mine.cells[0]
     (run / "config.json").write_text("{}")
     both = Task(str(tmp_path), (*mine.cells, "fmp-dataset-walk/seed1"), 10, ())
-    with pytest.raises(UserError, match="cells .*seed0, .*seed1 have not got as far as each other, since another"):
+    with pytest.raises(UserError, match="cells .*seed0, .*seed1 are at different iterations, because another"):
         both.run()
     assert (run / "metrics.csv").exists()
 

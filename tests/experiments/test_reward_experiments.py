@@ -266,7 +266,7 @@ def refused(tmp_path, monkeypatch, capsys):
 def test_run_without_a_policy(refused, tmp_path):
     runs.Run.create(tmp_path / "run", tiny())
     error = refused(generalization.main, "--run", "run", "--walking", "run", "--out", "out", "--smoke")
-    assert "has no checkpoint in checkpoints/: expected one, train it first" in error
+    assert "has no checkpoint in checkpoints/: train the run first" in error
     assert "none is not a run folder" in refused(
         static_teacher.main, "--run", "none", "--walking", "run", "--out", "out"
     )

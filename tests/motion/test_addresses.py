@@ -327,7 +327,7 @@ def test_folders_and_patterns_of_a_data_set(server, walking):
     assert library.listed(f"{SET}/g1/*.npz:2,walk") == f"{SET}/g1/b.npz:2,walk"
     assert library.listed(f"{SET}/**/*.npz:3") == f"{SET}/d.npz:1,{SET}/g1/b.npz:1,{SET}/g1/more/c.npz:1"
     assert library.listed(SET) == f"{SET}/d.npz:1"
-    with pytest.raises(UserError, match=r"no motion file fits the pattern .*x\*: expected some that end in \.npz"):
+    with pytest.raises(UserError, match=r"no motion file matches the pattern .*x\*: expected files that end in \.npz"):
         library.listed(f"{SET}/x*")
 
 

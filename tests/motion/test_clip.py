@@ -221,7 +221,7 @@ def test_missing_files(tmp_path):
     fails(r"unknown robot 'h1': expected one of strider, unitree_g1", "walk", robot="h1")
     other = tmp_path / "clip.bvh"
     other.write_text("HIERARCHY")
-    fails(r"clip\.bvh: a BVH skeleton, which `fmpjax motion retarget`", other)
+    fails(r"clip\.bvh: a BVH skeleton, which only `fmpjax motion retarget`", other)
 
 
 @pytest.mark.parametrize(

@@ -421,7 +421,9 @@ def test_faults(robot):
         gait.synthesize(robot, style=gait.Style(cadence=0))
     with pytest.raises(UserError, match="elbow is nan, expected a finite number"):
         gait.synthesize(robot, style=gait.Style(elbow=float("nan")))
-    with pytest.raises(UserError, match="the style's phases are flat 0.087, heel_off 0.6.*: expected growing numbers"):
+    with pytest.raises(
+        UserError, match="the style's phases are flat 0.087, heel_off 0.6.*: expected increasing numbers"
+    ):
         gait.synthesize(robot, style=gait.Style(heel_off=0.6))
 
 

@@ -72,7 +72,7 @@ def test_folders_and_patterns_are_their_files(tmp_path):
     assert library.listed(f"{tmp_path}/*.npz:3,walk") == f"{a}:1.5,{b}:1.5,walk"
     assert library.listed(f"{tmp_path}/[ab].npz") == f"{a}:0.5,{b}:0.5"
     assert len(library.parse(library.listed(f"{tmp_path}/**/*.npz"))) == 3
-    with pytest.raises(UserError, match=r"no file fits the pattern '.*/x\*': expected motion files"):
+    with pytest.raises(UserError, match=r"no file matches the pattern '.*/x\*': expected motion files"):
         library.listed(f"{tmp_path}/x*")
     shutil.copy(source, tmp_path / "in" / "c,d.npz")
     with pytest.raises(UserError, match="c,d.npz has a comma in its name"):
@@ -120,7 +120,7 @@ def test_windows_lie_within_a_clip(two, env):
     assert ends.tolist() == [*range(9, 30), *range(39, 230)]
     heights = np.asarray(env.clip_windows())[..., 2]
     assert heights.shape == (212, HORIZON)
-    # No window has feet on the floor and a metre above it.
+    # No window has feet on the floor and a meter above it.
     assert np.ptp(heights, axis=1).max() < 0.2
 
 

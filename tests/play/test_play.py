@@ -227,7 +227,7 @@ def test_policies_of_other_robots_and_rates_are_refused(robot, session):
     strider = robots.load("strider")
     with pytest.raises(UserError, match="the policy moves strider at 50 Hz: expected one of unitree_g1 at 50 Hz"):
         session.use(0, session.players[0].simulation.policy._replace(joint_names=strider.joint_names, robot="strider"))
-    with pytest.raises(UserError, match="held acts at 50 Hz and other at 25 Hz: expected policies of one rate"):
+    with pytest.raises(UserError, match="held acts at 50 Hz and other at 25 Hz: expected policies with the same rate"):
         play.Session([player(robot), player(robot, "other", rate=25.0)])
     with pytest.raises(UserError, match="there is nothing to play"):
         play.Session([])
@@ -358,7 +358,7 @@ def test_what_cannot_be_played_is_refused(run, robot, tmp_path):
     for name in ("checkpoints", "best"):
         for path in (run / name).iterdir():
             path.rmdir()
-    with pytest.raises(UserError, match="has no checkpoint: expected one, train it first"):
+    with pytest.raises(UserError, match="has no checkpoint: train the run first"):
         play.source_of(run)
 
 

@@ -146,7 +146,7 @@ def test_a_session_pretrains_before_it_compiles(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["amp"], "method 'amp' learns nothing before its policy: expected smp"),
+        (["amp"], "method 'amp' has no pretraining: expected smp"),
         (["gan"], "unknown method 'gan': expected one of fmp, "),
         (["smp", "--set", "smp"], "--set 'smp': expected section.field=value"),
     ],

@@ -58,7 +58,9 @@ def test_seeds_at_once_are_the_seeds_alone(group, tmp_path):
 def test_runs_that_differ_in_more_are_refused(tmp_path):
     one = runs.Run.create(tmp_path / "a", tiny(seed=0))
     other = runs.Run.create(tmp_path / "b", tiny(seed=1, **{"ppo.discount": 0.5}))
-    with pytest.raises(UserError, match=r"b has ppo.discount 0.5 and run .*a 0.97: runs that train at once differ in"):
+    with pytest.raises(
+        UserError, match=r"b has ppo.discount 0.5 and run .*a 0.97: runs that train together may differ only in"
+    ):
         runs.train(one, other)
 
 

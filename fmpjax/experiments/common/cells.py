@@ -125,7 +125,7 @@ def plan(specification: Specification) -> list[Cell]:
         group = "-".join(part for part in (method, reset, variant) if part)
         cells.append(Cell(f"{group}/seed{seed}", variant, configuration.preset(s.preset, **changes), changes))
     if not cells:
-        raise UserError("the plan has no cells: expected a method, a reset and a seed at least")
+        raise UserError("the plan has no cells: expected at least one method, reset and seed")
     for name, count in Counter(cell.name for cell in cells).items():
         if count > 1:
             raise UserError(f"the plan names {name} {count} times: expected every method, reset and seed once")

@@ -47,7 +47,7 @@ class Size:
     environments: int = 1024  # of which the first three quarters supply queries [P]
     updates: int = 9216  # [P]
     banks: int = 128  # of each of two reference groups [P]
-    paths: int = 512  # windows held out that are moved towards the expert [D]
+    paths: int = 512  # windows held out that are moved toward the expert [D]
     cohort: int = 128  # executed histories of each policy [P]
 
 

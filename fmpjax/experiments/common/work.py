@@ -77,7 +77,7 @@ class Task:
         if not begun:
             if any(iterations(folder) for folder in folders if (folder / "config.json").exists()):
                 raise UserError(
-                    f"cells {', '.join(self.cells)} have not got as far as each other, since another command trained "
+                    f"cells {', '.join(self.cells)} are at different iterations, because another command trained "
                     "some of them: start the command again"
                 )
             # A process that was killed while it made the folders left no more than a beginning in them.

@@ -31,7 +31,7 @@ def read(file: Path, robot: Robot, options: Options) -> Recording:
     if content is not None:
         return _known(file, content, robot, options)
     if head == b"HIERARCHY":
-        raise UserError(f"{file}: a BVH skeleton, which `fmpjax motion retarget` puts on a robot first")
+        raise UserError(f"{file}: a BVH skeleton, which only `fmpjax motion retarget` reads")
     return text.read(file, robot, options)
 
 
@@ -64,7 +64,7 @@ def _single(file: Path, content: dict) -> dict:
 def _known(file: Path, content: Mapping, robot: Robot, options: Options) -> Recording:
     """The recording by the first format that knows the names in ``content``."""
     if smpl.holds(content):
-        raise UserError(f"{file}: SMPL parameters of a human, which `fmpjax motion retarget` puts on a robot first")
+        raise UserError(f"{file}: SMPL parameters of a human, which only `fmpjax motion retarget` reads")
     for format_ in FORMATS:
         if set(format_.MARKS) <= set(content):
             return format_.read(file, content, robot, options)

@@ -237,7 +237,7 @@ def _proved(
     same, seen = _same_bodies(robot, names), _some(places)
     if places.shape[1] - 1 < LEAST_BODIES:
         raise UserError(
-            f"{file}: no joint_names, and {places.shape[1]} bodies do not prove the joints' order, "
+            f"{file}: no joint_names, and {places.shape[1]} bodies do not determine the order of the joints, "
             f"expected names or at least {LEAST_BODIES + 1} bodies"
         )
     errors = []

@@ -53,7 +53,7 @@ def read(file: Path) -> dict[str, object]:
     except OSError as error:
         raise UserError(f"cannot read {file}: {error.strerror or error}") from error
     if raw.startswith(OLD_TORCH):
-        raise UserError(f"{file}: an archive of PyTorch before 1.6, expected one that a newer PyTorch has saved again")
+        raise UserError(f"{file}: an archive of PyTorch before 1.6, expected one saved by a newer PyTorch")
     return _run(file, lambda: _Reader(io.BytesIO(_unpacked(raw))))
 
 
@@ -81,7 +81,7 @@ def _run(file: Path, reader, kind=dict):
     except OSError as error:
         raise UserError(f"cannot read {file}: {error.strerror or error}") from error
     except _Refused as refused:
-        raise UserError(f"{file}: {refused}, expected arrays, numbers and lists alone") from None
+        raise UserError(f"{file}: {refused}, expected only arrays, numbers, text, lists and dictionaries") from None
     except UserError:
         raise
     except Exception:
@@ -96,7 +96,7 @@ def _plain(value, depth: int = 0):
     if not isinstance(value, dict):
         return value
     if depth > MOST_DEPTH:
-        raise _Refused("the pickle has dictionaries in dictionaries too deep")
+        raise _Refused("the pickle has dictionaries that are nested too deep")
     return {name: _plain(inner, depth + 1) for name, inner in value.items()}
 
 
@@ -325,7 +325,7 @@ class _Tensor(_Array):
             or len(shape) != len(stride)
             or not all(type(x) is int and x >= 0 for x in (offset, *shape, *stride))
         ):
-            raise _Refused("the archive has a tensor that makes no sense")
+            raise _Refused("the archive has an invalid tensor")
         count = math.prod(shape)
         last = offset + sum((n - 1) * step for n, step in zip(shape, stride, strict=True))
         if count and (last >= len(storage) or count > len(storage)):

@@ -280,8 +280,8 @@ def oriented(
         if swapped.min() > 0:
             return read[other], Fact("quaternion", other, f"as {order} the root is upside down in all rows")
         raise UserError(
-            f"{file}: the root's z axis points down in all rows, expected a robot on its feet; "
-            "`fmpjax motion import` takes it with --quaternion wxyz or xyzw if this is meant"
+            f"{file}: the root's z axis points down in all rows, expected a standing robot; "
+            "if this is meant, give `fmpjax motion import` --quaternion wxyz or xyzw"
         )
     if usual.mean() < TILTED and swapped.min() > UPRIGHT:
         raise UserError(

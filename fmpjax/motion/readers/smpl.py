@@ -82,14 +82,16 @@ def read(file: Path, content: Mapping, model: Path | None) -> Smpl:
     gender = _text(file, content, "gender")
     if model is None:
         raise UserError(
-            f"{file}: SMPL parameters{f' ({gender})' if gender else ''} do not say where a body's joints are, "
+            f"{file}: SMPL parameters{f' ({gender})' if gender else ''} do not contain the positions of the joints, "
             f"expected {BRING}"
         )
     place = _key(content, PLACE)
     position = table(file, place, content[place], 3)
     turned = _rotations(file, content)
     if len(position) != len(turned) or not len(turned):
-        raise UserError(f"{file}: {len(position)} places of the body and {len(turned)} poses, expected as many of both")
+        raise UserError(
+            f"{file}: {len(position)} positions of the body and {len(turned)} poses, expected the same number of both"
+        )
     rate = _key(content, RATE)
     if not rate:
         raise UserError(f"{file}: no {' or '.join(RATE[:2])}, expected the rate in Hz")
@@ -131,10 +133,10 @@ def joint_places(model: Path, betas: np.ndarray) -> np.ndarray:
         )
     count = len(JOINTS)
     if not np.array_equal(parents[0, 1:count].astype(np.int64), PARENTS[1:]):
-        raise UserError(f"{model}: the first {count} joints do not hang together as those of SMPL, SMPL-H and SMPL-X")
+        raise UserError(f"{model}: the first {count} joints are not connected like those of SMPL, SMPL-H and SMPL-X")
     places = regressor[:count] @ (vertices + shapes[:, :, :used].astype(np.float64) @ betas[:used])
     if not np.isfinite(places).all() or np.linalg.norm(np.ptp(places, axis=0)) > 10:
-        raise UserError(f"{model}: joints that are not within a body's reach, expected a body in meters")
+        raise UserError(f"{model}: joints are too far apart for a body, expected a body in meters")
     return places
 
 

@@ -184,7 +184,7 @@ def _layout(
     place = {names[i].strip().lower()[-1]: i for i in reversed(place)}
     if len(turn) != 4 or len(place) != 3:
         raise UserError(
-            f"{file}: the header names joints and not the root's place and quaternion, expected such as "
+            f"{file}: the header names joints, but not the root's position and quaternion, expected names such as "
             "root_x, root_y, root_z, qx, qy, qz, qw"
         )
     time = next((i for i in rest if plain[i] in _TIME), None)
@@ -200,9 +200,7 @@ def _rate(file: Path, rows: np.ndarray, time: int | None) -> tuple[float, str]:
         step = float(np.median(np.diff(rows[:, time])))
         if 1 / MOST_RATE <= step <= 1.0 and np.abs(np.diff(rows[:, time]) - step).max() < 0.2 * step:
             return round(1 / step, 3), "the column of times"
-        raise UserError(
-            f"{file}: the column of times steps by {step:g} s on the median, expected even steps of seconds"
-        )
+        raise UserError(f"{file}: the column of times has steps of {step:g} s (median), expected even steps in seconds")
     named = re.search(r"(?<![0-9.])(\d{1,3}(?:\.\d+)?)[ _-]?(?:hz|fps)(?![a-z])", file.name.lower())
     if named and 1 <= float(named[1]) <= MOST_RATE:
         return float(named[1]), "the file's name; --fps replaces it"

@@ -128,7 +128,7 @@ def _landmark_poses(source: Capture, joint: dict[str, int], up: str | None, name
     rotation_wxyz = {part: poses.rotation_wxyz[:, i][:, turned] for i, part in enumerate(joint)}
     for a, b in landmarks.segments():
         if not np.linalg.norm(position[a] - position[b], axis=-1).min() > 0:
-            raise UserError(f"{name}: the skeleton's {a} and {b} are at one place, expected a distance")
+            raise UserError(f"{name}: the skeleton's {a} and {b} are at the same place, expected a distance")
     return up, position, rotation_wxyz
 
 

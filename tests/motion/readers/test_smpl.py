@@ -178,14 +178,14 @@ def test_it_says_which_file_the_user_must_bring(amass, tmp_path, capsys):
     for words in ("SMPL parameters (male)", "--body-model FILE", "smplh/GENDER/model.npz", "SMPLX_GENDER.npz"):
         assert words in error
     assert not (tmp_path / "out.npz").exists()
-    with pytest.raises(UserError, match="SMPL parameters of a human, which `fmpjax motion retarget` puts on a robot"):
+    with pytest.raises(UserError, match="SMPL parameters of a human, which only `fmpjax motion retarget` reads"):
         motion.load(amass())
 
 
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"trans": np.zeros((39, 3))}, "39 places of the body and 40 poses"),
+        ({"trans": np.zeros((39, 3))}, "39 positions of the body and 40 poses"),
         ({"poses": np.zeros((40, 63))}, "poses have 63 columns, expected 66 or more"),
         ({"poses": np.full((40, 66), np.nan)}, "poses row 0, column 0 is nan"),
         ({"poses": np.float64(1.0)}, "poses is float64 of shape ()"),
@@ -209,7 +209,7 @@ def test_wrong_parameters(amass, tmp_path, changed, words):
             {"J_regressor": np.eye(52, 50)},
             "J_regressor is float64 of shape (52, 50), expected",
         ),
-        ({"kintree_table": np.zeros((2, 52), int)}, "do not hang together as those of SMPL"),
+        ({"kintree_table": np.zeros((2, 52), int)}, "are not connected like those of SMPL"),
         ({"kintree_table": np.zeros((2, 50), int)}, "expected one parent for each of 52 joints"),
         ({"shapedirs": np.zeros((54, 2, 10))}, "shapedirs is float64 of shape (54, 2, 10), expected (54, 3, any)"),
         ({"v_template": np.zeros((0, 3))}, "0 vertices, expected 1 to"),

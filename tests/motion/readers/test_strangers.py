@@ -145,7 +145,7 @@ def test_a_header_puts_columns_in_order_and_times_give_the_rate(tmp_path, qpos):
     assert clip.reading.warnings == ("columns left out: left_thumb",)
     lines[0] = lines[0].replace("qw", "w0")
     (tmp_path / "a.csv").write_text("\n".join(lines))
-    refused(tmp_path / "a.csv", "names joints and not the root's place and quaternion")
+    refused(tmp_path / "a.csv", "names joints, but not the root's position and quaternion")
 
 
 def test_a_header_without_joints_and_a_spreadsheets_row_numbers(tmp_path, qpos):
@@ -238,7 +238,7 @@ def test_the_order_of_joints_without_names_is_proved(tmp_path, qpos, order, held
 def test_bodies_that_prove_nothing_are_refused(tmp_path, qpos):
     position, turn = places(qpos)
     arrays = {"fps": [RATE], "joint_pos": qpos[:, 7:], "body_pos_w": position[:, 1:3], "body_quat_w": turn[:, 1:3]}
-    refused(archive(tmp_path / "a.npz", **arrays), "2 bodies do not prove the joints' order")
+    refused(archive(tmp_path / "a.npz", **arrays), "2 bodies do not determine the order of the joints")
     # Pelvis and the trunk's chain: no leg or arm tells one order from another.
     rows = [BODY_NAMES.index(n) for n in ("pelvis", "waist_yaw_link", "waist_roll_link", "torso_link")]
     still = qpos.copy()

@@ -98,7 +98,7 @@ def done(robot, source):
 
 def test_walk_comes_back(robot, second, done):
     assert done.clip.rate == pytest.approx(30)
-    assert done.scale == pytest.approx(0.01, rel=1e-3)  # the file is in centimetres
+    assert done.scale == pytest.approx(0.01, rel=1e-3)  # the file is in centimeters
     assert done.residual.max() < 0.012
     error = done.clip.qpos - second.qpos
     # The hip of the walk is not quite fixed in the pelvis, as a human's is.
@@ -372,7 +372,7 @@ def test_faults(robot, source, monkeypatch):
         values = source.values.copy()
         values[:, 3:6] += [90.0, 0.0, 0.0]  # lies on its side
         retarget.retarget(source._replace(values=values), robot, "walk")
-    with pytest.raises(UserError, match="walk: the skeleton's left_hip and left_knee are at one place"):
+    with pytest.raises(UserError, match="walk: the skeleton's left_hip and left_knee are at the same place"):
         values = source.values.copy()
         at = 6 * source.names.index("LeftLeg")
         values[:, at : at + 3] = 0.0
