@@ -27,6 +27,7 @@ class Page:
         Raises:
           UserError: a policy cannot be read, or the page cannot be opened.
         """
+        serving.free_port(host, port)  # to refuse it before the policies are read, which takes a while
         names = [source.first for source in sources]
         players = [source.player(source.load(name)) for source, name in zip(sources, names, strict=True)]
         for i, player in enumerate(players):

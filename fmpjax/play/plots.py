@@ -1,6 +1,5 @@
 """Curves of the last seconds: speed, turning, feet on the floor, the motion prior's score."""
 
-from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -58,11 +57,12 @@ class Plots:
         self.score = (
             Chart(gui, "the motion prior's score", [*labels, "demonstration"], [*colors, TOLD]) if scored else None
         )
-        self._scores: deque[tuple[float, ...]] = deque(maxlen=round(KEPT * 10))
+        self._scores: list[tuple[float, ...]] = []
 
     def add_score(self, time: float, scores: Sequence[float], demonstration: float) -> None:
         """Remember the score of each player at a time (s), NaN where there is none, and the demonstration's."""
-        self._scores.append((time, *scores, demonstration))
+        # A new list, for another thread may be drawing the old one.
+        self._scores = [*(kept for kept in self._scores if kept[0] > time - KEPT), (time, *scores, demonstration)]
 
     def update(self) -> None:
         """Draw the last seconds."""

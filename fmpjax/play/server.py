@@ -36,13 +36,8 @@ def beside(server: viser.ViserServer, title: str) -> Generator[None]:
     panel.set_width(WIDTH)
 
 
-def start(title: str, host: str = HOST, port: int = PORT) -> Server:
-    """Serve an empty page.
-
-    Args:
-      title: of its panel.
-      host: address to listen at.
-      port: of it; 0 for any that is free.
+def free_port(host: str, port: int) -> int:
+    """The port itself, or one that is free for 0.
 
     Raises:
       UserError: the address is not this machine's, or the port is taken.
@@ -55,7 +50,7 @@ def start(title: str, host: str = HOST, port: int = PORT) -> Server:
         with socket.socket(family, kind, protocol) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
-            port = probe.getsockname()[1]
+            return probe.getsockname()[1]
     except socket.gaierror:
         raise UserError(f"--host is {host!r}: expected an address of this machine") from None
     except OSError as error:
@@ -63,6 +58,20 @@ def start(title: str, host: str = HOST, port: int = PORT) -> Server:
             f"no page at {host}:{port} ({error.strerror}): name another --port, or 0 for any, and an address of this "
             "machine as --host"
         ) from None
+
+
+def start(title: str, host: str = HOST, port: int = PORT) -> Server:
+    """Serve an empty page.
+
+    Args:
+      title: of its panel.
+      host: address to listen at.
+      port: of it; 0 for any that is free.
+
+    Raises:
+      UserError: the address is not this machine's, or the port is taken.
+    """
+    port = free_port(host, port)
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a box
         server = Server(host=host, port=port, label=title, verbose=False)
     if server.get_port() != port:
@@ -71,4 +80,5 @@ def start(title: str, host: str = HOST, port: int = PORT) -> Server:
     server.gui.configure_theme(
         control_width="large", show_logo=False, show_share_button=False, brand_color=(42, 111, 176)
     )
+    server.gui.main_panel.dock_right()  # where it floats it hides the robot on a small screen
     return server

@@ -240,11 +240,18 @@ def test_a_page_of_a_run_without_a_policy_is_refused(tmp_path):
 # --- the robot in the page -------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module", params=["compact", "full"])
+OBSERVED = {
+    "compact": {},
+    "full": {"env.axes": "world"},
+    "deployable": {"env.observation_history": 3},
+}
+
+
+@pytest.fixture(scope="module", params=OBSERVED)
 def real(request, tmp_path_factory, robot, walk):
     """A page with the real programs of others, and the states of its policy in sim2sim, ``[STEPS, 13 + 2 J]``."""
     folder = tmp_path_factory.mktemp("web") / "page"
-    changes = {"env.observation": request.param} | ({} if request.param == "compact" else {"env.axes": "world"})
+    changes = {"env.observation": request.param} | OBSERVED[request.param]
     try:
         made = written(folder, robot, walk, **changes)
     except UserError as error:

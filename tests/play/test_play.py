@@ -430,6 +430,35 @@ def test_a_page_is_served_on_this_machine_alone(page):
 
 
 @needs_viser
+def test_a_taken_port_is_refused_before_policies_are_read(page, run, monkeypatch):
+    from fmpjax.play.page import Page
+
+    monkeypatch.setattr("fmpjax.play.reader.Reader.policy", lambda *_, **__: pytest.fail("it was read"))
+    with pytest.raises(UserError, match="Address already in use"):
+        Page([play.source_of(run)], port=page.server.get_port())
+
+
+@needs_viser
+def test_the_controls_stand_beside_the_robot(page, monkeypatch):
+    """Where they float they hide it on a small screen."""
+    docked = []
+    monkeypatch.setattr(type(page.server.gui.main_panel), "dock_right", lambda panel: docked.append(panel))
+    serving.start("other", port=0).stop()
+    assert len(docked) == 1
+
+
+@needs_viser
+def test_the_scores_curve_shows_the_last_seconds(page):
+    for i in range(30):
+        page.plots.add_score(i / 2, (1.0, 2.0), 3.0)
+    for _ in range(2):
+        page.session.tick()
+    page.plots.update()
+    drawn = page.plots.score._handle.data[0]
+    assert (drawn[0], drawn[-1], len(drawn)) == (5.0, 14.5, 20)
+
+
+@needs_viser
 def test_the_controls_do_what_they_say(page):
     session, panel = page.session, page.panel
     assert list(panel._sliders) == [0, 2]  # the policies were told nothing sideways
