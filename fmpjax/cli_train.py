@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -36,7 +36,7 @@ def runs_module():
 
 
 @functools.cache
-def _preset(name: str) -> dict[str, object]:
+def _preset(name: str) -> dict[str, Any]:
     """The settings of a preset by their keys. Every start of the program asks for each of them several times."""
     return configuration.flatten(configuration.preset(name))
 
