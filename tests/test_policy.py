@@ -62,7 +62,9 @@ def small():
     ("shape", "has"), [((2,), "2 numbers"), ((4,), "4 numbers"), ((3, 1), "1 numbers"), ((), "no numbers")]
 )
 def test_an_observation_of_another_length_is_named(small, shape, has):
-    with pytest.raises(UserError, match=f"the observation has {has}: expected 3, as the 'compact' observation"):
+    with pytest.raises(
+        UserError, match=f"the observation has {has}: expected 3, for the observation 'compact' of this policy"
+    ):
         small(np.zeros(shape))
     assert small([0.0, 0.0, 0.0]).shape == (2,)
 

@@ -97,7 +97,8 @@ def test_help_names_the_defaults_of_training(shown):
 
 
 def test_a_default_that_depends_on_the_preset_says_so(monkeypatch):
-    monkeypatch.setattr(config.presets, "PRESETS", config.PRESETS | {"paper": {"robot": "another"}})
+    robots = {"paper": "another"}
+    monkeypatch.setattr(cli_train, "_preset", lambda name: {"robot": robots.get(name, "unitree_g1"), "method": "fmp"})
     said = cli_train._setting("robot").help_behavior_hint
     assert said == "(default: unitree_g1 in smoke, laptop, robust and robot, another in paper)"
     assert cli_train._setting("method").help_behavior_hint == "(default: fmp)"
