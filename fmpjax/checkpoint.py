@@ -18,9 +18,9 @@ from fmpjax.trainer import TrainState
 KEEP = 3  # last checkpoints kept
 
 
-def _flatten(state: TrainState) -> dict[str, np.ndarray]:
+def _flatten(state: TrainState) -> dict[str, Any]:
     leaves, _ = jax.tree_util.tree_flatten_with_path(state)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf) for path, leaf in leaves}
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
 class Checkpoints:
@@ -47,7 +47,7 @@ class Checkpoints:
         with self._manager(kind, keep) as manager:
             step = int(state.iteration)
             if step not in manager.all_steps():
-                manager.save(step, args=ocp.args.StandardSave(_flatten(state)), force=True)
+                manager.save(step, args=ocp.args.StandardSave(jax.tree.map(np.asarray, _flatten(state))), force=True)
 
     def iterations(self, *, best: bool = False) -> set[int]:
         """Iterations of the checkpoints."""
@@ -59,7 +59,7 @@ class Checkpoints:
         return max(self.iterations(best=best), default=None)
 
     def restore(self, like: TrainState, iteration: int | None = None, *, best: bool = False) -> TrainState:
-        """A checkpoint, by default the newest, or the best one, in the structure of ``like``.
+        """A checkpoint, by default the newest, or the best one, in the structure of ``like``: arrays, or their shapes.
 
         Raises:
           UserError: there is none, it cannot be read, or it is of another configuration.

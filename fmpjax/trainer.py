@@ -82,6 +82,10 @@ class Trainer:
         # A compiled chunk is given its state's buffers to write into, so no two leaves may share one.
         return jax.tree.map(jnp.copy, state)
 
+    def shapes(self) -> TrainState:
+        """A state's structure with shapes and types in place of arrays, into which a checkpoint is read."""
+        return jax.eval_shape(self._first, jax.random.PRNGKey(0))
+
     def _first(self, key: jax.Array) -> TrainState:
         key, ppo_key, prior_key, env_key = jax.random.split(key, 4)
         return TrainState(

@@ -42,7 +42,7 @@ def rows(run):
 def leaves(run, *, best=False):
     """A run's newest checkpoint, leaf by leaf."""
     trainer = runs.Run.open(run).trainer()
-    state = Checkpoints(run).restore(trainer.init(), best=best)
+    state = Checkpoints(run).restore(trainer.shapes(), best=best)
     return {jax.tree_util.keystr(path): np.asarray(x) for path, x in jax.tree_util.tree_flatten_with_path(state)[0]}
 
 
@@ -352,7 +352,7 @@ def test_a_truncated_checkpoint_is_named(trained, trainer, tmp_path):
     )
     largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
     with pytest.raises(UserError) as error:
-        Checkpoints(folder).restore(trainer.init())
+        Checkpoints(folder).restore(trainer.shapes())
     assert str(folder / "checkpoints" / "10") in str(error.value) and "\n" not in str(error.value)
 
 
@@ -364,7 +364,7 @@ def test_a_truncated_checkpoint_is_named(trained, trainer, tmp_path):
 def test_a_checkpoint_of_another_configuration_is_refused(trained, trainer, changes, said):
     other = Trainer(tiny(**changes), trainer.clip)
     with pytest.raises(UserError, match="is of another configuration") as error:
-        Checkpoints(trained).restore(other.init())
+        Checkpoints(trained).restore(other.shapes())
     assert said in str(error.value) and str(trained) in str(error.value)
 
 

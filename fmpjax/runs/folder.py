@@ -191,7 +191,7 @@ class Run:
         """The run's trainer and its best state, or its newest state if no evaluation selected a best one."""
         trainer = self.trainer()
         best = best and self.checkpoints.latest(best=True) is not None
-        return trainer, self.checkpoints.restore(trainer.init(), best=best)
+        return trainer, self.checkpoints.restore(trainer.shapes(), best=best)
 
     def save_evaluation(self, evaluation: Evaluation, name: str = "evaluation") -> None:
         write(self.folder / f"{name}.json", evaluation.to_json())

@@ -30,7 +30,6 @@ from fmpjax.errors import UserError
 from fmpjax.runs.folder import Run
 from fmpjax.runs.outputs import origin_of
 from fmpjax.runs.session import Session
-from fmpjax.trainer import TrainState
 
 EVERY = 5.0  # s between two files of a live policy
 SOME = 512  # windows of the demonstration that are scored
@@ -59,10 +58,6 @@ class Served:
         return policy.save(self.folder / f"{'best' if best else iteration}.npz", learned, self._said)
 
     @cached_property
-    def _first(self) -> TrainState:
-        return self.run.trainer().init()
-
-    @cached_property
     def _scores(self) -> Callable[..., jax.Array]:
         """(the prior's state, qpos, qvel) -> score."""
         trainer = self.run.trainer()
@@ -84,7 +79,7 @@ class Served:
         """What the prior says of the states ``[H, ...]``, and of the demonstration in the median."""
         if self._prior is None:
             iteration, best = self._at
-            self._prior = self.run.checkpoints.restore(self._first, iteration, best=best).prior
+            self._prior = self.run.checkpoints.restore(self.run.trainer().shapes(), iteration, best=best).prior
             self._demonstration = float(jnp.median(self._own_scores(self._prior)))
         now = self._scores(self._prior, jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
         return {"score": float(now), "demonstration": self._demonstration}

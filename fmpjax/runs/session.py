@@ -96,9 +96,8 @@ def first_states(trainer: Trainer, group: Sequence[Run], resume: bool) -> list[T
     Raises:
       UserError: there are checkpoints, and none that all runs have.
     """
-    states = [trainer.init(run.config.seed) for run in group]
     if not resume:
-        return states
+        return [trainer.init(run.config.seed) for run in group]
     newest = [run.checkpoints.iterations() for run in group]
     # Where the newest are gone the best one is a whole state, too.
     saved = [found | run.checkpoints.iterations(best=True) for found, run in zip(newest, group, strict=True)]
@@ -107,11 +106,10 @@ def first_states(trainer: Trainer, group: Sequence[Run], resume: bool) -> list[T
         if any(saved):  # never start again over what is there
             has = ", ".join(f"{r.folder} has {sorted(found) or 'none'}" for r, found in zip(group, saved, strict=True))
             raise UserError(f"{has}: expected a checkpoint of one iteration in all runs; resume each alone with --seed")
-        return states
-    start = max(common)
+        return [trainer.init(run.config.seed) for run in group]
+    start, like = max(common), trainer.shapes()
     return [
-        run.checkpoints.restore(like, start, best=start not in found)
-        for run, like, found in zip(group, states, newest, strict=True)
+        run.checkpoints.restore(like, start, best=start not in found) for run, found in zip(group, newest, strict=True)
     ]
 
 

@@ -49,7 +49,7 @@ def test_seeds_at_once_are_the_seeds_alone(group, tmp_path):
         assert float(other[name]) == pytest.approx(float(one[name]), rel=2e-2, abs=2e-3), name
     assert abs(float(one["fit/epsilon"]) / float(neighbor["fit/epsilon"]) - 1) > 1e-4
     trainer = alone.trainer()
-    states = [Checkpoints(f).restore(trainer.init()) for f in (alone.folder, group / "seed4", group / "seed3")]
+    states = [Checkpoints(f).restore(trainer.shapes()) for f in (alone.folder, group / "seed4", group / "seed3")]
     np.testing.assert_array_equal(states[0].prior.bank, states[1].prior.bank)
     np.testing.assert_array_equal(states[0].key, states[1].key)
     assert np.any(np.asarray(states[0].prior.bank) != np.asarray(states[2].prior.bank))
