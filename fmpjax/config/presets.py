@@ -157,7 +157,7 @@ COMMANDS: Mapping[str, Mapping[str, Any]] = {
         "motion": "gaits",
         "env.axes": "heading",
         "features.axes": "heading",
-        "env.last_cap": 500,  # turns on the spot fall after some seconds: episodes of three do not see it
+        "env.last_cap": 500,  # falls of turns on the spot come after more than three seconds
     },
     "phase": {"command.kind": "phase", "env.axes": "heading", "features.axes": "heading"},
     "motion": {"command.kind": "motion", "env.axes": "heading", "features.axes": "heading"},

@@ -102,15 +102,14 @@ class MjxPhysics:
                 model = model.tree_replace({name: jnp.asarray(x, qpos.dtype) for name, x in fields.items()})
 
             def step(data, targets):
-                data = data if targets is None else data.replace(ctrl=targets)
+                data = data.replace(ctrl=targets)
                 own = _saturated(model, data) if self.config.impl == "jax" else model
                 return mjx.step(own, data), None
 
             data = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-            if (several := targets.reshape(-1, self.model.nu)).shape[0] > 1:
-                data, _ = jax.lax.scan(step, data, several)
-            else:
-                data, _ = jax.lax.scan(step, data.replace(ctrl=targets), None, length=self.config.substeps)
+            # Targets of one control step are held; those of each physics step are as many already.
+            several = jnp.broadcast_to(targets.reshape(-1, self.model.nu), (self.config.substeps, self.model.nu))
+            data, _ = jax.lax.scan(step, data, several)
             reached = data.qpos, data.qvel, data.qacc_warmstart
             if not self._overflow:
                 return reached
@@ -129,8 +128,9 @@ def _saturated(model: mjx.Model, data: mjx.Data) -> mjx.Model:
     The implicit integrator then adds no damping for it, as in MuJoCo C and in Warp. MJX in JAX adds it all the same.
     """
     gain, bias, (low, high) = model.actuator_gainprm, model.actuator_biasprm, model.actuator_forcerange.T
-    force = gain[:, 0] * data.ctrl + bias[:, 0] + bias[:, 1] * data.qpos[7:] + bias[:, 2] * data.qvel[6:]
-    full = ((force <= low) | (force >= high))[:, None]
+    target = jnp.where(model.actuator_ctrllimited, jnp.clip(data.ctrl, *model.actuator_ctrlrange.T), data.ctrl)
+    force = gain[:, 0] * target + bias[:, 0] + bias[:, 1] * data.qpos[7:] + bias[:, 2] * data.qvel[6:]
+    full = (model.actuator_forcelimited & ((force <= low) | (force >= high)))[:, None]
     constant = jnp.zeros_like(bias).at[:, 0].set(jnp.clip(force, low, high))
     return model.tree_replace(
         {"actuator_gainprm": jnp.where(full, 0.0, gain), "actuator_biasprm": jnp.where(full, constant, bias)}

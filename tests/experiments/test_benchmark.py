@@ -280,14 +280,20 @@ def test_a_killed_cell_continues_to_its_end_and_is_then_left_alone(tmp_path, cap
     ((_, process),) = engine._running.values()
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    assert 0 < max(saved()) < 10 and not cells.finished(planned[0], tmp_path)
+    last = max(saved())
+    assert 0 < last < 10 and not cells.finished(planned[0], tmp_path)
+    before = (run / "metrics.csv").read_text().splitlines()[: 1 + last // 2]  # rows of two iterations each
 
     cells.run(planned, tmp_path, cluster="local")
     assert cells.finished(planned[0], tmp_path)
+    # What was saved was not trained again, training time included.
+    assert (run / "metrics.csv").read_text().splitlines()[: len(before)] == before
+    stamp = (run / "metrics.csv").stat().st_mtime_ns
     rows = [line.split(",") for line in (run / "metrics.csv").read_text().splitlines()]
     assert [row[0] for row in rows[1:]] == ["2", "4", "6", "8", "10"]
     (again,) = json.loads((run / "provenance.json").read_text())["resumed"]
     assert again["command"].startswith("fmpjax train --preset smoke --set=") and again["command"].endswith("--resume")
     cells.run(planned, tmp_path, cluster="local")
+    assert (run / "metrics.csv").stat().st_mtime_ns == stamp
     assert "1 cells, 1 of them finished before" in capsys.readouterr().out
     assert len(list((tmp_path / "jobs").glob("*_submitted.pkl"))) == 1
