@@ -62,8 +62,8 @@ render: run-is-named $(READY) ## render a run's policy as a video: RUN=runs/walk
 # Warp runs on a CPU too: its tests need it, training does without its 150 MB. The same holds for ONNX Runtime, viser and
 # the packages of the hub.
 test: $(READY) $(VENV)/.extras ## run every test, in WORKERS processes (2)
-	$(BIN)/python -m pytest -n $(or $(WORKERS),2) --dist loadfile --no-loadscope-reorder $(or $(ARGS),-m 'not alone')
-	$(if $(ARGS),,$(BIN)/python -m pytest -m alone)
+	$(BIN)/python -m pytest -n $(or $(WORKERS),2) --dist loadfile --no-loadscope-reorder $(or $(ARGS),--ignore tests/alone)
+	$(if $(ARGS),,$(BIN)/python -m pytest tests/alone)
 
 test-fast: $(READY) ## run the tests that take seconds
 	$(BIN)/python -m pytest -m 'not slow' $(ARGS)

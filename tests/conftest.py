@@ -14,11 +14,13 @@ from pathlib import Path
 # Before JAX is imported: the figures the tests compare are those of the CPU unless the caller says otherwise.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Four fake devices, on which programs that several devices share are tested; everything else runs on the first.
-# Compiling is most of the time. It takes a third without optimization and without the emitters of fused loops.
+# Compiling is most of the time. It takes a third without optimization and without the emitters of fused loops, and
+# less again if a program is not divided among threads, since all cores are busy.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_force_host_platform_device_count=4 --xla_backend_optimization_level=0 "
-    "--xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false",
+    "--xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false "
+    "--xla_cpu_parallel_codegen_split_count=1",
 )
 # Programs, the smallest too, are compiled once for all processes of the tests, and for the next time.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"fmpjax-tests-{os.getuid()}"))
