@@ -16,6 +16,8 @@ from flax import linen
 from fmpjax import learning, machine, sharding
 from fmpjax.acting import ActionRule, Seen, of_actor, of_critic
 from fmpjax.config import PPOConfig
+from fmpjax.errors import UserError
+from fmpjax.mirror import Mirror
 
 machine.import_mjx()  # which Brax imports
 
@@ -86,10 +88,20 @@ class PPO:
       config: of the networks and their updates.
       clock: steps of the longest episode, where the critic also observes the share of them that is over. A reward that
         depends on an episode's past needs it. 0 for a critic that observes what the policy does.
+      mirror: of observations and actions; with it an update sees half of the samples as their mirror images.
     """
 
-    def __init__(self, observation_size: int | Seen, action_size: int, config: PPOConfig, clock: int = 0):
-        self.config, self.clock = config, clock
+    def __init__(
+        self,
+        observation_size: int | Seen,
+        action_size: int,
+        config: PPOConfig,
+        clock: int = 0,
+        mirror: Mirror | None = None,
+    ):
+        if mirror is not None and isinstance(observation_size, Seen):
+            raise UserError("setting ppo.mirror is True: expected False where the critic sees more than the policy")
+        self.config, self.clock, self.mirror = config, clock, mirror
         self.observation_size, self.action_size = observation_size, action_size
         activation, initializers = learning.activation(config.activation), jax.nn.initializers
         # Otherwise uniform within 1 / sqrt(inputs), PyTorch's way.
@@ -182,6 +194,8 @@ class PPO:
         gain = jnp.clip((advantage - advantage.mean()) / spread, -config.advantage_clip, config.advantage_clip)
         return_variance = returns.var()
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), sharding.gather((batch, returns, gain)))
+        if self.mirror is not None:
+            flat = (self._mirrored(flat[0], jax.random.fold_in(key, 0)), *flat[1:])
         critic_key, actor_key = jax.random.split(key)
 
         def critic_loss(params, sample):
@@ -247,6 +261,17 @@ class PPO:
             "explained_variance": 1.0 - jnp.mean((returns - value) ** 2) / jnp.maximum(return_variance, 1e-8),
         }
         return new_state, metrics
+
+    def _mirrored(self, samples: Batch, key: jax.Array) -> Batch:
+        """Samples ``[n, ...]``, each with probability 1/2 as its mirror image; returns and advantages are the same."""
+        chosen = jax.random.bernoulli(key, shape=samples.reward.shape)[..., None]
+        pick = lambda image, x: jnp.where(chosen, image(x), x)  # noqa: E731
+        return samples._replace(
+            observation=pick(self.mirror.observation, samples.observation),
+            action=pick(self.mirror.action, samples.action),
+            mean=pick(self.mirror.action, samples.mean),
+            deviation=pick(self.mirror.spread, samples.deviation),
+        )
 
     def _epochs(self, loss, params, optimizer_state, rate, flat, key, epochs: int, batch: int):
         """Minibatch descent of ``loss``; statistics are means over the last epoch, skips are counted over all."""

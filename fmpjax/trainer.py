@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from fmpjax import commands, features, learning, metrics, physics, priors, robots, sharding
+from fmpjax import commands, features, learning, metrics, mirror, physics, priors, robots, sharding
 from fmpjax.config import Config
 from fmpjax.env import PER_ENVIRONMENT, Env, EnvState, Steps
 from fmpjax.errors import UserError
@@ -47,7 +47,9 @@ class Trainer:
         backend = physics.make(self.robot, config.physics, joint_friction=bool(config.disturbance.joint_friction))
         self.env = Env(self.robot, self.library, config, backend)
         clock = config.env.longest_episode if priors.remembers(config.method) else 0
-        self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo, clock)
+        form = features.observation_form(config)
+        image = mirror.make(self.robot, form, self.env.actions) if config.ppo.mirror else None
+        self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo, clock, image)
         windows, share = self.env.clip_windows(), self.env.window_share()
         self.feature_map = features.fit_feature_map(self.robot, windows, config.features, share)
         self.expert = priors.Expert(

@@ -206,6 +206,7 @@ class PPOConfig(Section):
     normalizer_floor: PositiveFloat = 1e-4  # least standard deviation of an observation [M]
     normalizer_from_clip: bool = False  # start the running statistics from the demonstration [M: no]
     normalizer_count: NonNegativeInt = 0  # cap of the running count, which then forgets slowly; 0 for none [M: 0]
+    mirror: bool = False  # updates see half of the samples as their mirror images, left for right [D]
 
     def check(self) -> None:
         """Raise a `UserError` where minibatches would not be equal."""

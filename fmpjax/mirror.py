@@ -1,0 +1,96 @@
+"""Mirror images of what a policy observes and does: the robot reflected in its own left-right plane."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fmpjax.actions import ActionMap
+from fmpjax.errors import UserError
+from fmpjax.features import observation_terms
+from fmpjax.motion.edit import SIDES, joint_mirror
+from fmpjax.robots import Robot
+
+# Reflection in y = 0. Vectors such as velocities change their y; turns, which are axial vectors, change their x and z.
+VECTOR, TURN = (1, -1, 1), (-1, 1, -1)
+SIX = VECTOR + VECTOR  # of a 6D rotation, which is the x and the z column of its matrix
+
+
+class Reflection(NamedTuple):
+    """A mirror image ``sign * x[..., order] + shift`` of numbers ``x [..., n]``; each field is ``[n]``."""
+
+    order: np.ndarray
+    sign: np.ndarray
+    shift: np.ndarray
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return (jnp.asarray(self.sign) * x[..., self.order] + jnp.asarray(self.shift)).astype(x.dtype)
+
+
+class Mirror(NamedTuple):
+    """The mirror images of observations ``[..., O]`` and of normalized actions ``[..., J]``."""
+
+    observation: Reflection
+    action: Reflection
+
+    @property
+    def spread(self) -> Reflection:
+        """Of the deviations of actions."""
+        return Reflection(self.action.order, np.abs(self.action.sign), np.zeros_like(self.action.shift))
+
+
+def make(robot: Robot, form: str, actions: ActionMap) -> Mirror:
+    """The mirror images for a robot whose policy observes ``form``, as `features.observation_form` gives it.
+
+    Raises:
+      UserError: the robot is not symmetric, or the mirror image of a part of the observation is not known.
+    """
+    joints, sign = joint_mirror(robot)
+    names = [robot.model.body(int(body) + 1).name for body in robot.key_body]
+    points = [names.index(_partner(name)) for name in names]
+    rows, cut = np.arange(robot.joint_count + (robot.jointless_row is not None)), robot.jointless_row
+    if cut is None:
+        rotations = joints
+    else:
+        row_of = np.delete(rows, cut)  # of each joint
+        rotations = rows.copy()
+        rotations[row_of] = row_of[joints]
+    parts = {
+        "root_height": (np.arange(1), np.ones(1)),
+        "velocity_commands": (np.arange(3), np.array([1, -1, -1])),
+        "velocity_errors": (np.arange(3), np.array([1, -1, -1])),
+        "joint_position": (joints, sign),
+        "joint_velocity": (joints, sign),
+        "joint_rotation_6d": _blocks(rotations, SIX),
+    }
+    for axes in ("root", "heading"):
+        parts[f"{axes}_rotation_6d"] = _blocks(np.arange(1), SIX)
+        parts[f"{axes}_linear_velocity"] = _blocks(np.arange(1), VECTOR)
+        parts[f"{axes}_angular_velocity"] = _blocks(np.arange(1), TURN)
+    for name in ("key_points", "heading_key_points"):
+        parts[name] = _blocks(np.array(points), VECTOR)
+    order, signs, start = [], [], 0
+    for name, width in observation_terms(robot, form).items():
+        if name not in parts:
+            raise UserError(f"setting ppo.mirror is True: the mirror image of the observation's {name} is not known")
+        order.append(start + parts[name][0])
+        signs.append(parts[name][1])
+        start += width
+    # The center of the actions is a pose, which may have a mirror image of its own.
+    shift = (sign * actions.center[joints] - actions.center) / actions.scale
+    return Mirror(
+        Reflection(np.concatenate(order), np.concatenate(signs).astype(float), np.zeros(start)),
+        Reflection(joints, sign * actions.scale[joints] / actions.scale, shift),
+    )
+
+
+def _partner(name: str) -> str:
+    side = next((side for side in SIDES if name.startswith(side)), "")
+    return SIDES.get(side, "") + name.removeprefix(side)
+
+
+def _blocks(order: np.ndarray, sign: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Order and signs of numbers that come in blocks, of which ``order`` names the partners."""
+    size = len(sign)
+    return (size * order[:, None] + np.arange(size)).ravel(), np.tile(sign, len(order))

@@ -1,0 +1,82 @@
+"""Mirror images against a mirrored motion: what the robot observes there, and the joint targets."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fmpjax import features, mirror, motion, robots
+from fmpjax.actions import action_map
+from fmpjax.errors import UserError
+from fmpjax.motion import edit
+from fmpjax.ppo import PPO, Batch
+from fmpjax.trainer import Trainer
+from tests.helpers import tiny
+
+
+@pytest.mark.parametrize("form", ["full", "compact", "full heading", "compact heading"])
+@pytest.mark.parametrize("name", ["unitree_g1", "unitree_g1_29dof", "strider"])
+def test_the_image_of_an_observation_is_that_of_the_mirrored_motion(name, form):
+    robot = robots.load(name)
+    clip = motion.load("walk", robot=name)
+    image = mirror.make(robot, form, action_map(robot, clip, "residual")).observation
+    ours, theirs = (
+        features.observation(robot, each.qpos[::9].astype(np.float32), each.qvel[::9].astype(np.float32), form)
+        for each in (clip, edit.mirrored(robot, clip))
+    )
+    np.testing.assert_allclose(image(ours), theirs, atol=2e-4)
+    assert np.abs(ours - theirs).max() > 0.1
+    np.testing.assert_array_equal(image(image(ours)), ours)
+
+
+def test_the_velocity_of_a_command_is_reflected(robot, walk):
+    image = mirror.make(robot, "compact heading velocity", action_map(robot, walk, "absolute")).observation
+    told = jnp.arange(1.0, 7.0)
+    observed = jnp.concatenate([jnp.zeros(86), told])
+    np.testing.assert_array_equal(image(observed)[-6:], [1, -2, -3, 4, -5, -6])
+
+
+@pytest.mark.parametrize("kind", ["absolute", "residual"])
+def test_mirrored_actions_have_mirrored_targets(robot, walk, kind):
+    clip = dataclasses.replace(walk, qpos=walk.qpos[:31])  # its mean pose is not symmetric
+    actions = action_map(robot, clip, kind)
+    order, sign = edit.joint_mirror(robot)
+    action = jnp.asarray(np.random.default_rng(0).normal(0, 0.2, (5, robot.joint_count)), jnp.float32)
+    image = mirror.make(robot, "compact", actions).action
+    np.testing.assert_allclose(actions(image(action)), sign * actions(action)[:, order], atol=1e-5)
+    np.testing.assert_allclose(image(image(action)), action, atol=1e-5)
+
+
+def test_what_has_no_image_is_refused(robot, walk):
+    with pytest.raises(UserError, match="ppo.mirror is True: the mirror image of the observation's clip_phase is not"):
+        Trainer(tiny(**{"ppo.mirror": True, "command.kind": "phase"}), walk)
+    with pytest.raises(UserError, match="setting ppo.mirror is True: expected False where the critic sees more"):
+        Trainer(tiny(**{"ppo.mirror": True, "disturbance.friction": (0.5, 1.0)}), walk)
+
+
+def test_an_update_teaches_both_sides_what_was_seen_on_one():
+    """A reward for actions above their mean, seen on one side alone: on the other side the mean falls as much."""
+    config = dataclasses.replace(
+        tiny().ppo, hidden=(32,), rollout_steps=8, actor_epochs=8, learning_rate=1e-3, bound_penalty=0.0, deviation=0.3
+    )
+    swapped = mirror.Reflection(np.array([1, 0]), np.ones(2), np.zeros(2))
+    opposite = mirror.Reflection(np.array([0]), np.array([-1.0]), np.zeros(1))
+    noise = jax.random.normal(jax.random.PRNGKey(1), (8, 64, 1))
+
+    def moved(image):
+        ppo = PPO(2, 1, config, mirror=image)
+        state = ppo.init(jax.random.PRNGKey(0))
+        seen = jnp.broadcast_to(jnp.array([1.0, 0.0]), (8, 64, 2))
+        mean, deviation = ppo.policy(state.actor, state.normalizer, seen)
+        never = jnp.zeros((8, 64), bool)
+        batch = Batch(seen, seen, mean + deviation * noise, mean, deviation, noise[..., 0], never, never)
+        after, _ = jax.jit(ppo.update)(state, batch, jax.random.PRNGKey(2))
+        before, now = (ppo.policy(actor, state.normalizer, jnp.eye(2))[0] for actor in (state.actor, after.actor))
+        return np.asarray(now - before)[:, 0]
+
+    alone, shared = moved(None), moved(mirror.Mirror(swapped, opposite))
+    assert alone[0] > 0.01 and shared[0] > 0.01
+    assert shared[1] < -0.5 * shared[0]
+    assert alone[1] > -0.5 * alone[0]
