@@ -158,6 +158,8 @@ class Train:
     """Show the policy as it trains in a page of the browser; docs/play.md."""
     port: int = 8080
     """Port of that page; 0 for any that is free."""
+    pictures: bool = True
+    """Draw frames, learning curves and a video at the end, which takes some seconds."""
     logger: Annotated[str | None, default("none")] = None
     """`wandb` (Weights & Biases) or `trackio`, which get the figures of metrics.csv; they stay on this machine."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
@@ -200,7 +202,7 @@ class Train:
         # Who sends a signal wants the process to end, not to film.
         if end is not runs.End.SIGNAL and sharding.primary():
             for run in group:
-                for path in runs.finish(run):
+                for path in runs.finish(run, pictures=self.pictures):
                     print(f"wrote {path}")
 
     def _connect(self) -> None:

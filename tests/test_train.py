@@ -206,7 +206,7 @@ def test_a_resume_in_a_new_process_is_exact(trained, stopped):
     """Two iterations, a checkpoint, and eight more in another process are ten in one, bit for bit."""
     assert Checkpoints(stopped).latest() == 2 and len(rows(stopped)) == 1
     done = subprocess.run(
-        command("train", "--resume", "--run", stopped),
+        command("train", "--resume", "--run", stopped, "--no-pictures"),
         capture_output=True,
         text=True,
         timeout=500,
@@ -218,7 +218,7 @@ def test_a_resume_in_a_new_process_is_exact(trained, stopped):
         np.testing.assert_array_equal(leaf, halves[name], err_msg=name)
     assert int(whole[".iteration"]) == 10
     made = json.loads((stopped / "provenance.json").read_text())
-    assert [part["command"] for part in made["resumed"]] == [f"fmpjax train --resume --run {stopped}"]
+    assert [part["command"] for part in made["resumed"]] == [f"fmpjax train --resume --run {stopped} --no-pictures"]
     assert made["command"] != made["resumed"][0]["command"]
     # An evaluation is logged where time runs out; apart from it every row agrees to its last digit.
     for a, b in zip(rows(trained), rows(stopped), strict=True):
@@ -274,7 +274,7 @@ def test_sigterm_saves_and_ends_well(tmp_path):
     assert saved == int(rows(folder)[-1]["iteration"]) >= 4
 
     # It goes on from there, and an end that is a time budget's is clean too.
-    cli.main(["train", "--resume", "--run", str(folder), "--minutes", "0.01"])
+    cli.main(["train", "--resume", "--run", str(folder), "--minutes", "0.01", "--no-pictures"])
     assert Checkpoints(folder).latest() > saved
     iterations = [int(r["iteration"]) for r in rows(folder)]
     assert iterations == list(range(2, iterations[-1] + 1, 2))

@@ -27,8 +27,8 @@ _EXPORTED = (
 ).split()
 
 
-def finish(run: Run) -> list[Path]:
-    """Evaluate the run's best policy, and write its table, learning curves and video; the paths written.
+def finish(run: Run, *, pictures: bool = True) -> list[Path]:
+    """Evaluate the run's best policy, and write its table and, unless told otherwise, its pictures; the paths written.
 
     A picture that cannot be made is left out.
     """
@@ -38,7 +38,7 @@ def finish(run: Run) -> list[Path]:
     run.save_evaluation(evaluation)
     transitions = int(state.iteration) * trainer.config.transitions_per_iteration
     print(f"best policy, {transitions:,} transitions:\n{table(evaluation)}")
-    paths = [run.folder / "evaluation.json", *_pictures(run, trainer, played)]
+    paths = [run.folder / "evaluation.json", *(_pictures(run, trainer, played) if pictures else ())]
     if (run.folder / "metrics.csv").exists() and MetricsLog.read(run.folder / "metrics.csv"):
         print(diagnose.text(diagnose.read(run.folder)))
     return paths

@@ -51,7 +51,7 @@ def test_two_processes_are_one(tmp_path):
     """The same run by two processes with two devices each and by one with one: metrics, and a checkpoint to go on."""
     address = free_address()
     short = {"transitions": 8 * 8 * 4, "evaluations": (1.0,)}
-    planned, common = tiny(**short), ["train", "--preset", "smoke", *settings(TINY | short)]
+    planned, common = tiny(**short), ["train", "--preset", "smoke", "--no-pictures", *settings(TINY | short)]
     joined = ["--run", tmp_path / "two", "--distributed", "--coordinator", address, "--processes", 2]
     flags = "import os; os.environ['XLA_FLAGS'] += ' --xla_force_host_platform_device_count=2'; "
     main = "import sys; from fmpjax.cli import main; main(sys.argv[1:])"

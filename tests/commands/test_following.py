@@ -111,7 +111,7 @@ def test_what_is_wanted_is_the_frame_after_the_step(monkeypatch, walk):
 def test_a_run_that_is_told_the_time_is_measured(tmp_path, capsys):
     folder = tmp_path / "run"
     command = ["train", "--preset", "smoke", "--motion", "walk", "--command", "phase", "--run", str(folder)]
-    cli.main([*command, *settings(TINY)])
+    cli.main([*command, "--no-pictures", *settings(TINY)])
     capsys.readouterr()
     cli.main(["evaluate", str(folder), "--commands", "--episodes", "5"])
     assert "reach the clip's end" in capsys.readouterr().out

@@ -248,7 +248,7 @@ def trained(tmp_path_factory):
     mine = folder / "mine.npz"
     motion.save(motion.load("turn_left"), mine)
     changes = TINY | {"evaluation_episodes": 32, "transitions": 128, "evaluations": (1.0,)}
-    command = ["train", "--preset", "smoke", "--motion", f"walk,{mine}:0.5", "--run", folder / "run"]
+    command = ["train", "--preset", "smoke", "--motion", f"walk,{mine}:0.5", "--run", folder / "run", "--no-pictures"]
     cli.main([str(a) for a in [*command, *settings(changes)]])
     mine.unlink()
     return runs.Run.open(folder / "run")
