@@ -147,8 +147,8 @@ class Trainer:
         measured = {"command/reward": steps.obeyed.mean(), "command/prior_reward": reward.mean()}
         return commands.combine(self.config.command, reward, steps.obeyed), measured
 
-    def compile(self, state: TrainState) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
-        """The compiled program of a run: ``config.chunk`` iterations, metrics averaged over them.
+    def compile(self, state: TrainState) -> jax.stages.Compiled:
+        """The compiled program of a run: ``config.chunk`` iterations, and their metrics, averaged.
 
         A state whose leaves have a leading axis of seeds, as `stack` makes it, gives metrics with that axis. A state
         that `place` put on a mesh stays there.

@@ -43,7 +43,8 @@ CHECKED = [
 if os.environ.get("FMPJAX_TEST_SHAPES") != "0":
     jaxtyping.install_import_hook(CHECKED, "tests.shapes.checked")
 
-from fmpjax import motion, robots  # noqa: E402
+from fmpjax import config, motion, robots  # noqa: E402
+from fmpjax.trainer import Trainer  # noqa: E402
 
 # What is imported stays, and tracing makes many small objects: collecting them as often as usual takes a twentieth.
 gc.freeze()
@@ -69,6 +70,28 @@ def few_programs():
     if maps.exists() and maps.read_bytes().count(b"\n") > 20_000:
         jax.clear_caches()
         gc.collect()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def once_compiled():
+    """FMP's program is traced and compiled once for all runs of a configuration, which takes seconds each time."""
+    programs, compiled = {}, Trainer.compile
+    free = ("transitions", "seed", "evaluations", "evaluation_episodes", "motion", "frames")  # not in the program
+
+    def compile_once(self, state):
+        if self.config.method != "fmp":
+            return compiled(self, state)
+        said = {key: value for key, value in config.flatten(self.config).items() if key not in free}
+        clips = [(clip.qpos.tobytes(), clip.qvel.tobytes()) for clip in self.library.clips]
+        leaves = [(x.shape, x.dtype, x.sharding) for x in jax.tree.leaves(state)]
+        key = hash((repr(said), repr(leaves), tuple(clips), self.library.weights))
+        if key not in programs:
+            programs[key] = compiled(self, state)
+        return programs[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "compile", compile_once)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -527,6 +527,7 @@ def test_memory_that_runs_out_leaves_the_last_checkpoint_good(trained, tmp_path,
                 raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 9 bytes")
             return program(state)
 
+        call.out_tree = program.out_tree
         return call
 
     monkeypatch.setattr(runs.clock, "SAVE_INTERVAL", -1.0)  # a checkpoint after every call

@@ -50,8 +50,9 @@ class Session:
         self._state, self._program = state, self.trainer.compile(state)
 
     def metric_names(self) -> list[str]:
-        """Names of the metrics of an iteration."""
-        return sorted(jax.eval_shape(self.trainer.iteration, self.states[0])[1])
+        """Names of the metrics of an iteration; the program is compiled before."""
+        form = self._program.out_tree
+        return sorted(jax.tree.unflatten(form, range(form.num_leaves))[1])
 
     def advance(self) -> tuple[list[dict[str, float]], float]:
         """Call the program once: each run's metrics, and the seconds that it took."""
