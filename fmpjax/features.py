@@ -320,7 +320,7 @@ def relative_windows(frames: Float[jax.Array, "*batch H F"]) -> Float[jax.Array,
 class FeatureMap(NamedTuple):
     """The fixed map f from windows to the features that transport compares.
 
-    Standardise with the demonstration's mean and deviation, clip, weigh, divide by sqrt(d), where d counts the full
+    Standardize with the demonstration's mean and deviation, clip, weigh, divide by sqrt(d), where d counts the full
     frame's coordinates: distances are those of the full features, 2,390 for the G1.
     """
 

@@ -1,10 +1,20 @@
-"""Rules of the house that a machine can check: the length of files and functions."""
+"""Rules of the house that a machine can check: the length of files and functions, American spelling."""
 
 import ast
+import re
+from pathlib import Path
 
 from tests.helpers import ROOT
 
 MOST_LINES = {"file": 400, "function": 60}
+SPELLED = ("fmpjax", "benchmarks", "tests", "examples", "docs", "experiments", "robots", "motions")  # folders
+BRITISH = re.compile(
+    r"centre|colour|favour|behaviour|neighbour|honour|metre\b|catalogue|licence|analysed|analysing|towards|\bgrey\b"
+    r"|(?:model|label|travel|cancel|signal)l(?:ed|ing)"
+    r"|(?:normal|general|optim|standard|regular|initial|random|penal|summar|organ|recogn|visual|minim|maxim|quant"
+    r"|parametr|discret|serial|synchron|linear|emphas|util)is(?:e|ing|ation)",
+    re.IGNORECASE,
+)
 
 
 def long(path: str, text: str) -> list[str]:
@@ -42,3 +52,29 @@ def test_what_is_too_long_is_found():
     assert long("a.py", "def f():\n" + body * 59) == [] and long("a.py", "def f():\n" + body * 60) == ["a.py:f"]
     assert long("a.py", "def f():\n    # long: reason\n" + body * 60) == []
     assert long("a.py", "    # long: elsewhere\ndef f():\n".lstrip() + body * 60) == ["a.py:f"]
+
+
+def british(text: str) -> list[str]:
+    """The British spellings in a text, in its order."""
+    return BRITISH.findall(text)
+
+
+def test_spelling_is_american():
+    texts = list(ROOT.glob("*.md"))
+    for folder in SPELLED:
+        for suffix in ("py", "md", "toml", "js", "html", "ipynb"):
+            texts += (ROOT / folder).rglob(f"*.{suffix}")
+    found = {path.relative_to(ROOT).as_posix(): british(path.read_text()) for path in texts if path != Path(__file__)}
+    assert len(found) > 200
+    assert {path: words for path, words in found.items() if words} == {}
+
+
+def test_british_spelling_is_found():
+    assert british("arm_centre, millimetre, normalised, Optimisation, labelled") == [
+        "centre",
+        "metre",
+        "normalise",
+        "Optimisation",
+        "labelled",
+    ]
+    assert british("arm_center, parameters, geometry, otherwise, raised, analyses of noise") == []

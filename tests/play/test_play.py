@@ -122,7 +122,7 @@ def test_a_push_gives_the_robot_its_impulse(robot, session):
     np.testing.assert_allclose(velocity[:2], np.array([-10.0, 20.0]) / robot.total_mass, atol=0.02)
 
 
-def test_a_hand_pulls_towards_the_pointer(session):
+def test_a_hand_pulls_toward_the_pointer(session):
     sim = session.players[0].simulation
     before = sim.qpos[0]
     body = sim.root_body
