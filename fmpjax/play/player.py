@@ -8,7 +8,7 @@ import numpy as np
 
 from fmpjax import rotations
 from fmpjax.motion import MotionClip
-from fmpjax.sim2sim import Policy, Simulation
+from fmpjax.sim2sim import ExportedPolicy, Simulation
 
 KEPT = 10.0  # s of the past in the plots
 PUSH = 0.1  # s that a push lasts
@@ -84,7 +84,7 @@ class Player:
         self.states: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=64)  # newest last, for the motion prior
         self.restart(np.zeros(3))
 
-    def use(self, policy: Policy) -> None:
+    def use(self, policy: ExportedPolicy) -> None:
         """Go on with another policy of the same robot."""
         self.simulation.policy = policy
 

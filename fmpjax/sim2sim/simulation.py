@@ -8,7 +8,7 @@ import numpy as np
 
 from fmpjax.errors import UserError
 from fmpjax.sim2sim.differences import differences
-from fmpjax.sim2sim.exported import Policy
+from fmpjax.sim2sim.exported import ExportedPolicy
 from fmpjax.sim2sim.model import check_servos, drives_joint, prepared
 from fmpjax.sim2sim.observation import TERMS
 
@@ -23,7 +23,7 @@ class Simulation:
 
     def __init__(
         self,
-        policy: Policy,
+        policy: ExportedPolicy,
         path: str | Path,
         *,
         own_gains: bool = False,

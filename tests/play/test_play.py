@@ -21,7 +21,7 @@ from fmpjax.errors import UserError
 from fmpjax.play import server as serving
 from fmpjax.play.devices import Gamepad, Keyboard
 from fmpjax.play.player import Drag, Player, heading_velocity, moved
-from fmpjax.sim2sim import Policy
+from fmpjax.sim2sim import ExportedPolicy
 
 HOLD = np.array([[-0.5, 0.0, -0.8], [1.0, 0.0, 0.8]])  # what the test's policies may be told
 
@@ -66,7 +66,7 @@ def said(robot, terms, *, rate=50.0, joints=None):
     }
 
 
-def standing(robot, *, steered=True, **changes) -> Policy:
+def standing(robot, *, steered=True, **changes) -> ExportedPolicy:
     """A policy that holds the default pose; its second observation is what it was told."""
     terms = {"root_height": 1} | ({"velocity_commands": 3} if steered else {})
     size = sum(terms.values())
