@@ -168,7 +168,7 @@ def _play(trainer: Trainer, state: PPOState, rows: jax.Array, told: jax.Array):
         taken = frozen.step(trainer, env, policy, now, alive, drawn)
         reached = taken.now
         return (reached, taken.alive), (
-            velocity.heading_velocity(reached.observed.frame, layout),
+            layout.heading_velocity(reached.observed.frame),
             reached.physics.qpos,
             taken.alive,
         )

@@ -73,7 +73,7 @@ class Player:
         """
         self.label, self.simulation, self.clips = label, simulation, clips
         self._in_motion, self._random = in_motion, np.random.default_rng(seed)
-        self._speeds = np.array([heading_velocity(clip) for clip in clips])
+        self._speeds = np.array([clip.heading_velocities.mean(0) for clip in clips])
         self.feet = _feet(simulation)
         self.ghost: Ghost | None = None
         self.drag: Drag | None = None
@@ -189,14 +189,6 @@ class Player:
                     mujoco.mj_contactForce(model, data, i, force)
                     loads[foot] += force[0]
         return loads
-
-
-def heading_velocity(clip: MotionClip) -> np.ndarray:
-    """A clip's mean velocity in its own heading, ``[3]`` (m/s forward and to the left, rad/s)."""
-    yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
-    (vx, vy), cosine, sine = clip.qvel[:, :2].T, np.cos(yaw), np.sin(yaw)
-    turn = (yaw[-1] - yaw[0]) / max(clip.duration, 1e-6)
-    return np.array([(vx * cosine + vy * sine).mean(), (vy * cosine - vx * sine).mean(), turn])
 
 
 def moved(qpos: np.ndarray, start: np.ndarray, place: np.ndarray) -> np.ndarray:

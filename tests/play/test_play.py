@@ -20,7 +20,7 @@ from fmpjax.config import preset
 from fmpjax.errors import UserError
 from fmpjax.play import server as serving
 from fmpjax.play.devices import Gamepad, Keyboard
-from fmpjax.play.player import Drag, Player, heading_velocity, moved
+from fmpjax.play.player import Drag, Player, moved
 from fmpjax.sim2sim import ExportedPolicy
 
 HOLD = np.array([[-0.5, 0.0, -0.8], [1.0, 0.0, 0.8]])  # what the test's policies may be told
@@ -263,7 +263,7 @@ def test_a_configuration_is_moved_over_the_floor_and_turned(walk):
 def test_the_demonstration_that_moves_like_the_command_goes_along(robot):
     clips = tuple(motion.load(name) for name in ("walk", "turn_left"))
     one = player(robot, clips=clips)
-    fast, turning = map(heading_velocity, clips)
+    fast, turning = (clip.heading_velocities.mean(0) for clip in clips)
     one.restart(fast)
     assert one.ghost.clip is clips[0]
     np.testing.assert_allclose(one.ghost.qpos(), one.simulation.qpos, atol=1e-9)
