@@ -1,4 +1,4 @@
-"""Rules of the house that a machine can check: the length of files and functions, American spelling."""
+"""Rules of the house that a machine can check: the length of files and functions, spelling, the table of modules."""
 
 import ast
 import re
@@ -78,3 +78,29 @@ def test_british_spelling_is_found():
         "labelled",
     ]
     assert british("arm_center, parameters, geometry, otherwise, raised, analyses of noise") == []
+
+
+def imported(module: Path) -> set[str]:
+    """The modules of the package that a file, or the files of a folder, import, by their first name."""
+    found = set()
+    for path in [module] if module.is_file() else module.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module == "fmpjax":
+                found.update(name.name for name in node.names if name.name != "__version__")
+            elif isinstance(node, ast.ImportFrom):
+                found.update(re.findall(r"^fmpjax\.(\w+)", node.module or ""))
+            elif isinstance(node, ast.Import):
+                found.update(word for name in node.names for word in re.findall(r"^fmpjax\.(\w+)", name.name))
+    return found - {module.stem}
+
+
+def test_the_table_of_modules_says_what_each_imports():
+    """The last column of docs/architecture.md, where it names modules."""
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    said = dict(re.findall(r"^\| `(\w+(?:\.py|/))` \|.*\| ([^|]+) \|$", text, re.MULTILINE))
+    there = {path.name for path in (ROOT / "fmpjax").glob("*.py")} - {"__init__.py"}
+    there |= {f"{path.parent.name}/" for path in (ROOT / "fmpjax").glob("*/__init__.py")}
+    assert set(said) == there
+    listed = {name: words for name, words in said.items() if not re.search("all above|modules below", words)}
+    expected = {name: set(re.findall(r"\w+", words)) for name, words in listed.items()}
+    assert {name: imported(ROOT / "fmpjax" / name) for name in listed} == expected
