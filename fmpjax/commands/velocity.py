@@ -32,9 +32,9 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
     Of the demonstrations' velocities, half of the commands are one of them, and half lie between two. An episode begins
     with the velocity that its demonstration has there. The default pose stands.
 
-    A step earns by the running mean of the errors. In a walk the root turns and surges to and fro with every stride, by
-    more than an error that matters: the reward would hardly depend on the error at the moment. The networks see the
-    running mean, since without it they cannot tell what a step will earn.
+    The running mean of the errors determines what a step earns. In a walk the root turns and surges back and forth with
+    every stride, by more than an error that matters: a reward of the present error would hardly depend on how well the
+    policy obeys. The networks see the running mean, since without it they cannot tell what a step will earn.
 
     Args:
       config: of the command.

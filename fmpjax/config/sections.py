@@ -2,7 +2,7 @@
 
 A field states its type with its choices or bounds, its default, which is the paper's, and in a comment its meaning, its
 unit and its source. `reading` checks values by these types; `fmpjax settings` and docs/settings.md print all of it. A
-rule about several fields stands in the ``check`` of their section, or of `Config` where they are of several sections.
+rule about several fields is in the ``check`` of their section, or of `Config` where they are of several sections.
 """
 
 import dataclasses

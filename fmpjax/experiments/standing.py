@@ -172,7 +172,7 @@ def gradients(trainer: Trainer, state: TrainState, moments: Moments) -> dict[str
 
 
 def _groups(robot: Robot) -> dict[str, slice]:
-    """Where the quantities stand in a compact frame."""
+    """Where the quantities are in a compact frame."""
     at = FrameLayout.of(robot)
     return {
         "root_position": at.root, "root_rotation": at.rotation, "joint_angles": slice(at.cosine.start, at.sine.stop),

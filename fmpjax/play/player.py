@@ -85,7 +85,7 @@ class Player:
         self.restart(np.zeros(3))
 
     def use(self, policy: ExportedPolicy) -> None:
-        """Go on with another policy of the same robot."""
+        """Continue with another policy of the same robot."""
         self.simulation.policy = policy
 
     def restart(self, command: np.ndarray, *, here: bool = False) -> None:

@@ -93,7 +93,7 @@ class Session:
             self.pace = float(np.clip(pace, SLOWEST, 1.0))
 
     def use(self, player: int, policy: ExportedPolicy) -> None:
-        """Go on with another policy of the same robot.
+        """Continue with another policy of the same robot.
 
         Raises:
           UserError: it is of another robot, or acts at another rate.

@@ -5,7 +5,7 @@ update. The state holds the iteration, so a run that resumes does not pretrain a
 the noise that the model finds in a noised window, relative to the mean error of the policy's windows so far.
 
 Where this departs from the source: windows are FMP's, with joint velocities and at the control rate, standardized by
-FMP's deviations, and ``smp.network`` may be ``small``. Coordinates that stand twice in the full window count once. The
+FMP's deviations, and ``smp.network`` may be ``small``. Coordinates that are twice in the full window count once. The
 running mean includes the rollout that is scored.
 """
 

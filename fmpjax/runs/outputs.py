@@ -196,7 +196,7 @@ def course_video(
     course: Sequence[tuple[float, tuple[float, float, float]]],
     path: Path | None,
 ) -> Path:
-    """The policy under a course of commanded velocities, which stand in the picture; the path written.
+    """The policy under a course of commanded velocities, which the picture shows; the path written.
 
     Args:
       run: whose command is a velocity.

@@ -25,7 +25,7 @@ def differences(
     if abs(mass - policy.total_mass) > 1e-3:
         said.append(f"mass {mass:.3f} kg, in training {policy.total_mass:.3f} kg")
     if ids != sorted(ids):
-        said.append("joints stand in another order; they are found by name")
+        said.append("the joints are in another order; they are found by name")
     moved = set(ids)
     others = [j for j in range(model.njnt) if j not in moved and model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
     if others:
