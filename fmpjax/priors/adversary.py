@@ -15,7 +15,7 @@ from flax import linen
 
 from fmpjax import learning, sharding
 from fmpjax.config import AdversaryConfig
-from fmpjax.priors.base import Expert, Metrics, MotionPrior, Rollout, flatten
+from fmpjax.priors.base import Expert, Metrics, MotionPrior, Rollout, flatten, known_reward
 
 
 class Normalizer(NamedTuple):
@@ -234,7 +234,7 @@ def discriminator(
         pool = flatten(rollout, expert.windows[0])
         logits = adversary.score(state, pool)
         reward = reward_of(logits).reshape(rollout.valid.shape)
-        reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
+        reward = known_reward(reward, rollout.valid)
         state, summary = adversary.fit(state, pool, logits, key)
         return state, reward, summary
 

@@ -19,7 +19,7 @@ from flax import linen
 
 from fmpjax import learning, sharding
 from fmpjax.config import SMP_NETWORKS, Config
-from fmpjax.priors.base import Expert, MotionPrior, Pretraining, Rollout, flatten
+from fmpjax.priors.base import Expert, MotionPrior, Pretraining, Rollout, flatten, known_reward
 
 # Settings on which the pretrained model depends.
 PRETRAINED_BY = (
@@ -177,7 +177,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         )
         scores = exponent(state, error)
         reward = settings.scale * jnp.exp(scores).reshape(rollout.valid.shape)
-        reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
+        reward = known_reward(reward, rollout.valid)
         summary = {
             **learning.score_metrics(*learning.median_and_spread(scores), exponent(state, demonstration)),
             "pretraining_loss": state.loss,
