@@ -126,6 +126,11 @@ class CommandConfig(Section):
         given = (self.ahead, self.sideways, self.turn)
         return tuple(ends or (0.0, 0.0) for ends in given) if any(given) else None
 
+    def require(self, kind: str) -> None:
+        """Raise a `UserError` where a run's command is of another kind."""
+        if self.kind != kind:
+            raise UserError(f"the run's command.kind is {self.kind!r}: expected {kind!r}")
+
     def check(self) -> None:
         """Raise a `UserError` where a range is none."""
         for name in ("hold", "ahead", "sideways", "turn"):
