@@ -127,7 +127,7 @@ class Evaluation:
 
 
 def pace_error(figures: Mapping[str, Any]) -> float:
-    """Relative error of an evaluation's late speed; 1, as of a robot that stands, where nobody lasts so long."""
+    """Relative error of an evaluation's late speed; 1, as of a robot that stands, where no episode lasts so long."""
     late = figures["path_speed" if figures["demonstration_turning"] > metrics.TURNS else "late_speed"]
     unit = max(figures["demonstration_speed"], LEAST_SPEED)
     return 1.0 if np.isnan(late) else abs(late - figures["demonstration_speed"]) / unit

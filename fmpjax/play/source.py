@@ -80,7 +80,7 @@ class RunSource:
         self._scored = False
 
     def names(self) -> list[str]:
-        """Best, newest and live, as far as there are such, then the iterations of the checkpoints, the last first."""
+        """Best, newest and live, if they exist, then the iterations of the checkpoints, the last first."""
         numbers = _numbers(self.folder / "checkpoints")
         live = (self.folder / policy.LIVE).is_file()
         kinds = ((BEST, _numbers(self.folder / "best")), (NEWEST, numbers), (LIVE, live))
