@@ -4,7 +4,7 @@ Both commits are measured in turn, each time in a process of its own, since time
 machine cannot be compared. A line for each measurement goes to a CSV file that is committed:
 
 - ``laptop``, ``paper``: time of a training iteration over that of the baseline (`throughput.py`); the lowest and the
-  highest of the pairs stand beside the median;
+  highest of the pairs are beside the median;
 - ``cores``: rate of `laptop` on all cores over its rate on one, this checkout alone;
 - ``first``: wall time of `make train PRESET=smoke` the second time, when its programs are compiled already, in seconds.
 

@@ -35,12 +35,12 @@ _FIGURES = ("frames.png", "curves.png", "steering.png", "robustness.png", "polic
 
 
 def place(page: str) -> str:
-    """Where a page of the site stands in the checkout."""
+    """Where a page of the site is in the checkout."""
     return PAGES.get(page, page if page.startswith("experiments/") else f"docs/{page}")
 
 
 def address(path: str) -> str:
-    """Where a file or folder of the checkout stands in the site, as the source of a page or as a file."""
+    """Where a file or folder of the checkout is in the site, as the source of a page or as a file."""
     for page, source in PAGES.items():
         if path == source:
             return page

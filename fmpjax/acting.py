@@ -11,7 +11,7 @@ def _keep(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 
 class Seen(NamedTuple):
-    """What the networks observe where the critic sees more than the actor; elsewhere one array stands for both."""
+    """What the networks observe where the critic sees more than the actor; elsewhere one array is for both."""
 
     actor: Any  # [..., O]
     critic: Any  # [..., C]

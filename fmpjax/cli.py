@@ -56,7 +56,6 @@ class Evaluate:
 
     def _commands(self, run, trainer, state) -> None:
         from fmpjax import following, steering
-        from fmpjax.files import write
         from fmpjax.viz import along, heat
 
         if sentence := steering.beyond(trainer):
@@ -66,30 +65,30 @@ class Evaluate:
         if trainer.config.command.kind == "phase":
             followed = following.measure(trainer, state.ppo, **changed)
             print(f"iteration {int(state.iteration):,}:\n{following.table(followed)}")
-            path = self._file(run, "following")
-            write(path, followed.to_json())
-            picture = along.draw(path.with_suffix(".png"), followed.seconds, following.curves(followed))
-            print(f"wrote {path}\nwrote {picture}")
+            self._save(run, "following", followed, along.draw, followed.seconds, following.curves(followed))
             return
         found = steering.measure(trainer, state.ppo, **changed)
         print(f"iteration {int(state.iteration):,}:\n{steering.table(found)}")
-        path = self._file(run, "steering")
-        write(path, found.to_json())
-        print(f"wrote {path}\nwrote {heat.draw(path.with_suffix('.png'), *steering.maps(found))}")
+        self._save(run, "steering", found, heat.draw, *steering.maps(found))
 
     def _robust(self, run, trainer, state) -> None:
         from fmpjax import robustness
-        from fmpjax.files import write
         from fmpjax.viz import bars
 
         episodes = self.episodes or robustness.EPISODES
         print(f"compiling the episodes, {episodes} of each case; each case takes seconds ...", flush=True)
         print(f"iteration {int(state.iteration):,}:\n{robustness.heading()}")
         found = robustness.measure(trainer, state.ppo, episodes=episodes, note=lambda line: print(line, flush=True))
-        path = self._file(run, "robustness")
-        write(path, found.to_json())
         title = f"{run.folder.resolve().name}: first episodes of {found.seconds:g} s, {episodes} per bar"
-        print(f"wrote {path}\nwrote {bars.draw(path.with_suffix('.png'), robustness.bars(found), title)}")
+        self._save(run, "robustness", found, bars.draw, robustness.bars(found), title)
+
+    def _save(self, run, name: str, found, draw, *drawn) -> None:
+        """Write figures and their picture, ``draw(path, *drawn)``, to the run's folder."""
+        from fmpjax.files import write
+
+        path = self._file(run, name)
+        write(path, found.to_json())
+        print(f"wrote {path}\nwrote {draw(path.with_suffix('.png'), *drawn)}")
 
     def _file(self, run, name: str) -> Path:
         """The file of the run that holds figures of its best policy, or of its newest."""

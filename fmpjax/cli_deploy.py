@@ -47,7 +47,7 @@ class Sim2Sim:
             raise UserError(f"--video is {self.video}: expected a name that ends in .mp4 or .gif")
         course = sim2sim.course(self.course)
         policy = sim2sim.load(self.policy)
-        # The robot of the training stands in the video for the model, whose looks may be missing.
+        # The video shows the robot of the training, because the looks of the model may be missing.
         robot = None if self.video is None else robots.load(policy.robot)
         if not course and "velocity_commands" in policy.terms:
             course = sim2sim.COURSE

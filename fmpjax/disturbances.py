@@ -151,7 +151,7 @@ class Disturbances:
         before = jnp.where(episode.fresh[:, None, None], newest[:, None], episode.sensed)
         every = jnp.concatenate([before, newest[:, None]], axis=1)
         episode = episode._replace(sensed=every[:, 1:], fresh=jnp.zeros_like(episode.fresh))
-        # A term's whole history stands before the next term's.
+        # A term's whole history comes before the next term's.
         parts = jnp.split(every, np.cumsum(self._widths)[:-1], axis=-1)
         whole = jnp.concatenate([part.reshape(len(part), -1) for part in parts], axis=-1)
         return whole, state._replace(episode=episode)
@@ -191,7 +191,7 @@ class Disturbances:
 
 
 def make(config: Config, robot: Robot, actions: ActionMap, told: int) -> Disturbances | None:
-    """The disturbances that a configuration asks for; None where nothing stands between robot and networks."""
+    """The disturbances that a configuration asks for; None where it asks for none."""
     if not config.disturbance.any and config.env.observation != "deployable":
         return None
     return Disturbances(config, robot, actions, told)

@@ -25,7 +25,7 @@ from fmpjax.motion.clip import refined
 from fmpjax.offenders import Offender
 from fmpjax.robots import Robot
 
-# Of the demonstrations, from which a prior learns: 22 minutes at 50 Hz, 0.3 GB. Of more, an even part stands for all.
+# Of the demonstrations, from which a prior learns: 22 minutes at 50 Hz, 0.3 GB. Of more, an even part represents all.
 MOST_WINDOWS = 1 << 16
 
 # Fields of `EnvState` with a leading axis of environments.

@@ -127,7 +127,7 @@ class Evaluation:
 
 
 def pace_error(figures: Mapping[str, Any]) -> float:
-    """Relative error of an evaluation's late speed; 1, as of a robot that stands, where nobody lasts so long."""
+    """Relative error of an evaluation's late speed; 1, as of a robot that stands, where no episode lasts so long."""
     late = figures["path_speed" if figures["demonstration_turning"] > metrics.TURNS else "late_speed"]
     unit = max(figures["demonstration_speed"], LEAST_SPEED)
     return 1.0 if np.isnan(late) else abs(late - figures["demonstration_speed"]) / unit
@@ -258,7 +258,7 @@ class Evaluator:
         feet, contact = self._feet(jnp.asarray(played.qpos[:, detail]))
         late = metrics.summarize(speed)
         own_speed = [planar_speed(clip) for clip in library.clips]
-        own_turn = np.array([turning(clip) for clip in library.clips])
+        own_turn = np.array([clip.turning for clip in library.clips])
         turns = abs(own_turn[played.clip[detail]]) > metrics.TURNS
         return Evaluation(
             noise=self.noise,
@@ -341,12 +341,6 @@ class Evaluator:
 def planar_speed(clip: MotionClip) -> float:
     """Mean speed of a clip's root over the floor, m/s."""
     return float(np.linalg.norm(np.diff(clip.qpos[:, :2], axis=0), axis=-1).mean() * clip.rate)
-
-
-def turning(clip: MotionClip) -> float:
-    """Mean turning rate of a clip's root, rad/s, positive to the left."""
-    yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
-    return float(yaw[-1] - yaw[0]) / clip.duration
 
 
 def _listed(motions: tuple[Share, ...]) -> list[Share]:

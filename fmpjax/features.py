@@ -272,7 +272,7 @@ def frame_size(robot: Robot) -> int:
 
 
 def compact_weights(robot: Robot) -> Float[np.ndarray, " F"]:
-    """How often a compact coordinate stands in the full frame, as a distance weight (square root), ``[F]``."""
+    """How often a compact coordinate occurs in the full frame, as a distance weight (square root), ``[F]``."""
     cosine, sine, _ = _rotation_terms(robot)
     if not np.isin(np.abs(robot.joint_axis), (0, 1)).all():
         raise UserError(f"robot {robot.name} has a hinge off its body's axes: compact frames need axes along x, y or z")
@@ -283,7 +283,7 @@ def compact_weights(robot: Robot) -> Float[np.ndarray, " F"]:
 
 
 class _Planar(NamedTuple):
-    """Where the x and y of a compact frame's vectors stand."""
+    """Where the x and y of a compact frame's vectors are."""
 
     other: np.ndarray  # [F] int, of an x its y and of a y its x
     sign: np.ndarray  # [F] 1 for an x, -1 for a y, 0 for what does not turn with the heading
@@ -320,7 +320,7 @@ def relative_windows(frames: Float[jax.Array, "*batch H F"]) -> Float[jax.Array,
 class FeatureMap(NamedTuple):
     """The fixed map f from windows to the features that transport compares.
 
-    Standardise with the demonstration's mean and deviation, clip, weigh, divide by sqrt(d), where d counts the full
+    Standardize with the demonstration's mean and deviation, clip, weigh, divide by sqrt(d), where d counts the full
     frame's coordinates: distances are those of the full features, 2,390 for the G1.
     """
 

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from fmpjax import features, frozen, jsons, metrics, tables
-from fmpjax.errors import UserError
 from fmpjax.frames import FrameLayout
 from fmpjax.ppo import PPOState
 from fmpjax.trainer import Trainer
@@ -63,8 +62,7 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 128) -> Follow
     Raises:
       UserError: the run's command is no phase.
     """
-    if trainer.config.command.kind != "phase":
-        raise UserError(f"the run's command.kind is {trainer.config.command.kind!r}: expected 'phase'")
+    trainer.config.command.require("phase")
     env, rate = trainer.env, trainer.config.control_rate
     last = env.clip_rows - 1
     latest = max(env.first_row, last - round(LEAST * rate) * env.stride)

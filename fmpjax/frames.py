@@ -1,6 +1,6 @@
 """Where each quantity is in a compact frame. Only this file knows the order."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,18 @@ class FrameLayout(NamedTuple):
     def size(self) -> int:
         """F, numbers in a frame."""
         return self[-1].stop
+
+    def axis_heights(self, frames: Float[Any, "*batch F"]) -> Float[Any, "*batch 2"]:
+        """The heights of the root's x and z axes, unit vectors: the part of its rotation that no turning changes."""
+        return frames[..., self.rotation][..., 2::3]
+
+    def heading_velocity(self, frames: Float[Any, "*batch F"]) -> Float[jax.Array, "*batch 3"]:
+        """The root's velocity in the heading frame: m/s ahead, m/s and rad/s to the left."""
+        forward = frames[..., FORWARD]
+        x, y = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
+        vx, vy, _ = jnp.split(frames[..., self.velocity], 3, axis=-1)
+        turning = frames[..., self.angular_velocity][..., 2:]
+        return jnp.concatenate([vx * x + vy * y, vy * x - vx * y, turning], axis=-1)
 
     @classmethod
     def join(cls, **parts: Float[jax.Array, "*batch _"]) -> Float[jax.Array, "*batch F"]:

@@ -14,7 +14,7 @@ class Step(NamedTuple):
     """Where a control step has led ``N`` episodes."""
 
     now: EnvState  # of episodes that had ended before, as it was
-    alive: jax.Array  # [N] bool, whether the episode goes on
+    alive: jax.Array  # [N] bool, whether the episode continues
     fell: jax.Array  # [N] bool, whether it ended in this step by a fall
     action: jax.Array  # [N, J] normalized, taken
     earned: jax.Array | None  # [N] in [0, 1], the command's reward of the step; None without a command

@@ -45,7 +45,7 @@ def body_poses(robot: Robot, qpos: jax.Array) -> BodyPoses:
 
     ancestor = robot.body_parent.copy()
     while (ancestor >= 0).any():
-        # Only bodies that still have an ancestor move on; the others already stand in the world.
+        # Only bodies that still have an ancestor move on; the others are already in world axes.
         moving = np.flatnonzero(ancestor >= 0)
         parts = parts.at[:, moving].set(_composed(parts[:, ancestor[moving]], parts[:, moving]))
         ancestor = np.where(ancestor >= 0, ancestor[np.maximum(ancestor, 0)], -1)

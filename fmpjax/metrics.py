@@ -3,7 +3,7 @@
 Everything is a pure function on NumPy arrays, computed in float64. ``T`` recorded steps, ``N`` environments; the state
 after step ``k`` is in row ``k``, at time ``(k + 1) / rate``. ``length [N]``, 1 to T, counts the rows of the first
 episode; later rows are never read. The metrics return one value per episode, NaN where an episode does not contribute;
-`summarize` makes the number to report and how many episodes stand behind it.
+`summarize` makes the number to report and how many episodes it is of.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation (section IV-A of the paper; the settings are MimicKit's).
+"""Proximal policy optimization (section IV-A of the paper; the settings are MimicKit's).
 
 Hidden layers, the critic, the action distribution and the running statistics of observations are Brax's. An update fits
 the critic to TD(lambda) returns first and then improves the actor, each for its own number of epochs.

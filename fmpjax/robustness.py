@@ -140,7 +140,7 @@ class Player:
     def __init__(self, trainer: Trainer, episodes: int = EPISODES, seed: int = SEED):
         self.trainer, self.count = trainer, episodes
         config = trainer.config
-        # Whatever there may be is on; how large it is stands in the state.
+        # Every disturbance is on; their sizes are in the state.
         everything = dataclasses.replace(
             MJLAB, torso_mass=(0.0, 0.0), joint_friction=(0.0, 0.0), delay=(0, 2 * config.physics.substeps)
         )
@@ -244,7 +244,7 @@ def table(cells: Any) -> str:
 
 
 def heading() -> str:
-    """What stands above the columns of `table`."""
+    """The names of the columns of `table`."""
     names = ("disturbance", "size", "falls", "95 %", "length", "speed", "excursion")
     return tables.lines("  {:<18} {:<12} {:>12} {:>14} {:>8} {:>10} {:>10}", [names])
 

@@ -25,7 +25,7 @@ class Group:
 
 
 def default(text: object) -> Any:
-    """For ``Annotated``: what an option that is None stands for, as the help shows it."""
+    """For ``Annotated``: what an option that is None means, as the help shows it."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {text})")
 
 

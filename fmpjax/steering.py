@@ -10,7 +10,6 @@ import numpy as np
 
 from fmpjax import frozen, jsons, tables
 from fmpjax.commands import velocity
-from fmpjax.errors import UserError
 from fmpjax.frames import FrameLayout
 from fmpjax.ppo import PPOState
 from fmpjax.trainer import Trainer
@@ -79,8 +78,7 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 256, each: int
       UserError: the run's command is no velocity.
     """
     config, library = trainer.config.command, trainer.env.library
-    if config.kind != "velocity":
-        raise UserError(f"the run's command.kind is {config.kind!r}: expected 'velocity'")
+    config.require("velocity")
     rng, rate = np.random.default_rng(seed), trainer.config.control_rate
     low, high = velocity.extent(config, library)
     grid = _grid(low, high)
@@ -168,7 +166,7 @@ def _play(trainer: Trainer, state: PPOState, rows: jax.Array, told: jax.Array):
         taken = frozen.step(trainer, env, policy, now, alive, drawn)
         reached = taken.now
         return (reached, taken.alive), (
-            velocity.heading_velocity(reached.observed.frame, layout),
+            layout.heading_velocity(reached.observed.frame),
             reached.physics.qpos,
             taken.alive,
         )

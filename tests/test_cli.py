@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -268,3 +269,19 @@ def test_a_device_that_is_not_there(tmp_path):
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1].startswith("fmpjax: JAX_PLATFORMS is 'cuda', but JAX finds no such device")
     assert not (tmp_path / "run").exists()
+
+
+def test_figures_and_their_picture_are_written_side_by_side(tmp_path, capsys):
+    found, run = SimpleNamespace(to_json=lambda: "{}\n"), SimpleNamespace(folder=tmp_path)
+
+    def draw(path, *drawn):
+        path.write_text(f"{drawn}")
+        return path
+
+    cli.Evaluate(tmp_path, last=True)._save(run, "steering", found, draw, "a", 1)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {
+        "steering-last.json": "{}\n",
+        "steering-last.png": "('a', 1)",
+    }
+    printed = capsys.readouterr().out
+    assert printed == f"wrote {tmp_path}/steering-last.json\nwrote {tmp_path}/steering-last.png\n"

@@ -131,7 +131,7 @@ SIGN = jnp.where(jnp.arange(COUNT) % 2 == 0, 1.0, -1.0) * ONES
 
 
 def slow_advantage(reward, value, next_value, fell, timed_out, discount, gae_lambda):
-    """Generalised advantages as a sum over what follows, term by term."""
+    """Generalized advantages as a sum over what follows, term by term."""
     steps, count = reward.shape
     out = np.zeros((steps, count))
     for i in range(count):
@@ -302,7 +302,7 @@ def test_ratio_clip(sign, moves):
 
 def test_bound_penalty_pulls_only_beyond_one():
     ppo, state, plain = whole_batch()
-    _, _, penalised = whole_batch(bound_penalty=10.0)
+    _, _, penalized = whole_batch(bound_penalty=10.0)
 
     def with_mean(value):
         params = jax.tree.map(lambda x: x, state.actor)
@@ -314,7 +314,7 @@ def test_bound_penalty_pulls_only_beyond_one():
         start = with_mean(value)
         batch = random_batch(ppo, start)
         without, plain_metrics = plain(start, batch, jax.random.PRNGKey(0))
-        with_, metrics = penalised(start, batch, jax.random.PRNGKey(0))
+        with_, metrics = penalized(start, batch, jax.random.PRNGKey(0))
         np.testing.assert_allclose(metrics["bound_penalty"], max(abs(value) - 1, 0) ** 2, rtol=1e-5)
         norms = metrics["actor_gradient_norm"], plain_metrics["actor_gradient_norm"]
         if abs(value) < 1:

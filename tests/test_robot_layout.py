@@ -195,6 +195,8 @@ def test_a_model_that_would_be_misread_is_refused(tmp_path, spoil, expected):
 def test_a_robot_without_a_walk_or_with_other_legs_says_so(strider, tmp_path):
     with pytest.raises(UserError, match=r"robot 'strider' has no \[gait\] in its robot.toml"):
         gait.synthesize(dataclasses.replace(strider, gait={}))
+    with pytest.raises(UserError, match=r"the \[gait\] of robot 'strider' has 'arm_middle': expected 'speed'"):
+        gait.synthesize(dataclasses.replace(strider, gait=strider.gait | {"arm_middle": 0.1}))
     with pytest.raises(UserError, match="robot 'strider' has no joint 'neck', which its walk moves"):
         gait.synthesize(dataclasses.replace(strider, gait=strider.gait | {"joints": {"waist_yaw": "neck"}}))
     model, facts = source()

@@ -58,13 +58,8 @@ def make(robot: Robot, library: MotionLibrary, frames: jax.Array, stride: int) -
             (JOINTS, jnp.mean(2.0 - 2.0 * cosine, axis=-1)),
             (JOINT_VELOCITIES, jnp.mean(off[..., layout.joint_velocity] ** 2, axis=-1)),
             (HEIGHT, off[..., layout.root][..., 2] ** 2),
-            (TILT, jnp.sum(_heights(off[..., layout.rotation]) ** 2, axis=-1)),
+            (TILT, jnp.sum(layout.axis_heights(off) ** 2, axis=-1)),
         )
         return sum(share * jnp.exp(-sharpness * error) for (share, sharpness), error in errors)
 
     return Command(1 + 2 * len(HARMONICS), lambda key, shape: (), begin, advance, observe, wanted=following)
-
-
-def _heights(rotation: jax.Array) -> jax.Array:
-    """What of a 6D rotation ``[..., 6]`` does not change with the heading: the heights of its two axes."""
-    return rotation[..., 2::3]

@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import nnls
 
-from fmpjax import rotations
 from fmpjax.commands.base import Command, Told
 from fmpjax.config import CommandConfig
-from fmpjax.frames import FORWARD, FrameLayout
+from fmpjax.frames import FrameLayout
 from fmpjax.motion import MotionClip, MotionLibrary
 from fmpjax.robots import Robot
 
@@ -33,9 +32,9 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
     Of the demonstrations' velocities, half of the commands are one of them, and half lie between two. An episode begins
     with the velocity that its demonstration has there. The default pose stands.
 
-    A step earns by the running mean of the errors. In a walk the root turns and surges to and fro with every stride, by
-    more than an error that matters: the reward would hardly depend on the error at the moment. The networks see the
-    running mean, since without it they cannot tell what a step will earn.
+    The running mean of the errors determines what a step earns. In a walk the root turns and surges back and forth with
+    every stride, by more than an error that matters: a reward of the present error would hardly depend on how well the
+    policy obeys. The networks see the running mean, since without it they cannot tell what a step will earn.
 
     Args:
       config: of the command.
@@ -73,7 +72,7 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
         return Velocity(table[rows], drawn.left, jnp.zeros_like(drawn.value))
 
     def advance(state, drawn, frame):
-        error = compressed(heading_velocity(frame, layout) - state.value, config.error_scale)
+        error = compressed(layout.heading_velocity(frame) - state.value, config.error_scale)
         off = state.off + newest * (error - state.off)
         held = state._replace(off=off)
         never = jnp.zeros(state.left.shape, bool)
@@ -150,19 +149,9 @@ def _said(velocity: np.ndarray) -> str:
     return f"{ahead:.2f} m/s ahead, {left:.2f} m/s and {turn:.2f} rad/s to the left"
 
 
-def heading_velocity(frame: jax.Array, layout: FrameLayout) -> jax.Array:
-    """Root velocity ``[..., 3]`` of frames ``[..., F]`` in the heading frame: m/s ahead, m/s and rad/s to the left."""
-    forward = frame[..., FORWARD]
-    x, y = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
-    vx, vy, _ = jnp.split(frame[..., layout.velocity], 3, axis=-1)
-    return jnp.concatenate([vx * x + vy * y, vy * x - vx * y, frame[..., layout.angular_velocity][..., 2:]], axis=-1)
-
-
 def velocities(clip: MotionClip) -> np.ndarray:
     """A clip's velocity in its own heading, ``[T, 3]`` (m/s, m/s, rad/s): means over a second about each sample."""
-    yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
-    (vx, vy), cosine, sine = clip.qvel[:, :2].T, np.cos(yaw), np.sin(yaw)
-    own = np.stack([vx * cosine + vy * sine, vy * cosine - vx * sine, np.gradient(yaw) * clip.rate], axis=1)
+    own = clip.heading_velocities
     width = min(len(own), max(1, round(AVERAGED * clip.rate)))
     sums = np.concatenate([np.zeros((1, 3)), np.cumsum(own, axis=0)])
     first = np.clip(np.arange(len(own)) - width // 2, 0, len(own) - width)

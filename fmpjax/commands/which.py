@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from fmpjax.commands.base import Command, Told
-from fmpjax.commands.velocity import heading_velocity
 from fmpjax.config import CommandConfig
 from fmpjax.errors import UserError
 from fmpjax.frames import FrameLayout
@@ -92,10 +91,10 @@ def posture(frame: jax.Array, layout: FrameLayout) -> jax.Array:
     """
     parts = (
         frame[..., layout.root][..., 2:],
-        frame[..., layout.rotation][..., 2::3],
+        layout.axis_heights(frame),
         frame[..., layout.cosine],
         frame[..., layout.sine],
-        heading_velocity(frame, layout),
+        layout.heading_velocity(frame),
         frame[..., layout.joint_velocity],
     )
     return jnp.concatenate(parts, axis=-1)

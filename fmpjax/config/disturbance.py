@@ -14,40 +14,42 @@ _STEEPEST = 0.5  # rad, beyond which a floor is no floor
 
 @dataclasses.dataclass(frozen=True)
 class DisturbanceConfig(Section):
-    """What disturbs the robot in training; an empty range or zero leaves it as it is, docs/robustness.md."""
+    """Disturbances of the robot in training, docs/robustness.md; an empty range or zero means none."""
 
     # Of each environment, drawn once.
 
-    friction: Ends = ()  # factor of the sliding friction of soles and floor, which is 1 for the G1 [D]; 0.3 to 1.2 [J]
+    # factor of the sliding friction between soles and floor, which is 1 for the G1 [D]; 0.3 to 1.2 [J]
+    friction: Ends = ()
     torso_mass: Ends = ()  # kg, added to the torso [D]; -1 to 3 [U, H]
-    # m along x, y and z, by which the torso's center of mass is off at most [D]; 0.025, 0.025, 0.03 [J]
+    # m, largest offset of the torso's center of mass along x, y and z [D]; 0.025, 0.025, 0.03 [J]
     torso_center: tuple[NonNegativeFloat, ...] = ()
     stiffness: Ends = ()  # factor of each servo's kp [D]; 0.9 to 1.1 [H]
     damping: Ends = ()  # factor of each servo's kd [D]; 0.9 to 1.1 [H]
     strength: Ends = ()  # factor of each motor's largest torque [D]
-    joint_friction: Ends = ()  # N m, dry friction of each joint in place of physics.frictionloss [D]; 0.05 to 0.2 [Y]
+    joint_friction: Ends = ()  # N m, dry friction of each joint instead of physics.frictionloss [D]; 0.05 to 0.2 [Y]
     armature: Ends = ()  # factor of each motor's inertia [D]; 1 to 1.05 [Y]
-    slope: NonNegativeFloat = 0.0  # rad, steepest floor, which falls in any direction [D]
-    encoder_bias: NonNegativeFloat = 0.0  # rad, error at most of each joint's encoder [D]; 0.015 [J]
+    slope: NonNegativeFloat = 0.0  # rad, steepest slope of the floor, in any direction [D]
+    encoder_bias: NonNegativeFloat = 0.0  # rad, largest constant error of each joint's encoder [D]; 0.015 [J]
 
     # Of each episode.
 
-    # physics steps, shortest and longest time by which actions come late [D]; 0 to physics.substeps [H]
+    # physics steps, shortest and longest delay of the actions [D]; 0 to physics.substeps [H]
     delay: Annotated[tuple[NonNegativeInt, ...], Meta(max_length=2)] = ()
 
     # Of each control step.
 
-    turn_noise: NonNegativeFloat = 0.0  # rad/s, error at most of the observed angular velocity [D]; 0.2 [J]
-    tilt_noise: NonNegativeFloat = 0.0  # rad, the same of the direction of gravity [D]; 0.05 [J]
-    angle_noise: NonNegativeFloat = 0.0  # rad, the same of joint angles [D]; 0.01 [J]
-    velocity_noise: NonNegativeFloat = 0.0  # rad/s, the same of joint velocities [D]; 1.5 [J]
+    turn_noise: NonNegativeFloat = 0.0  # rad/s, largest error of the observed angular velocity [D]; 0.2 [J]
+    tilt_noise: NonNegativeFloat = 0.0  # rad, largest error of the observed direction of gravity [D]; 0.05 [J]
+    angle_noise: NonNegativeFloat = 0.0  # rad, largest error of the observed joint angles [D]; 0.01 [J]
+    velocity_noise: NonNegativeFloat = 0.0  # rad/s, largest error of the observed joint velocities [D]; 1.5 [J]
     push_interval: Ends = ()  # s, shortest and longest time between two pushes [D]; 1 to 3 [J]
-    push_speed: Ends = (0.0, 0.5)  # m/s, added to the root along the floor, in any direction [D]; 0.5 on each axis [J]
-    push_lift: NonNegativeFloat = 0.0  # m/s, the same at most up or down [D]; 0.4 [J]
-    push_tilt: NonNegativeFloat = 0.0  # rad/s, the same of rolling and of pitching [D]; 0.52 [J]
-    push_turn: NonNegativeFloat = 0.0  # rad/s, the same of turning [D]; 0.78 [J]
-    push_start: Fraction = 1.0  # share of its size that a push has at the start of a run [D]
-    # by which that share grows per rollout while more than env.cap_share of the episodes survive, and else shrinks [D]
+    # m/s, smallest and largest change of the root's velocity along the floor [D]; 0.5 on each axis [J]
+    push_speed: Ends = (0.0, 0.5)
+    push_lift: NonNegativeFloat = 0.0  # m/s, largest change of the root's velocity up or down [D]; 0.4 [J]
+    push_tilt: NonNegativeFloat = 0.0  # rad/s, largest change of its rolling and of its pitching [D]; 0.52 [J]
+    push_turn: NonNegativeFloat = 0.0  # rad/s, largest change of its turning [D]; 0.78 [J]
+    push_start: Fraction = 1.0  # share of their full size that pushes have at the start of a run [D]
+    # increase of this share per rollout while more than env.cap_share of the episodes survive; else it decreases [D]
     push_growth: NonNegativeFloat = 0.0
 
     @property

@@ -36,7 +36,7 @@ def stock(policy: Policy, robot: Robot, origin: Origin) -> str:
     """The settings with which Unitree's stock program runs the policy, YAML.
 
     Raises:
-      UserError: the policy takes commands, and nobody says from which ranges.
+      UserError: the policy takes commands, and their ranges are not known.
     """
     terms = features.observation_terms(robot, policy.observation)
     if "velocity_commands" in terms and origin.commands is None:

@@ -75,5 +75,5 @@ def model_xml(robot: Robot, physics: PhysicsConfig) -> str:
         for joint in world.iter("joint"):
             if joint.get("type") != "free":
                 joint.set("frictionloss", repr(float(physics.frictionloss)))
-    # ElementTree drops what stands before the root, where a file says whose it is.
+    # ElementTree drops what is before the root, where a file says whose it is.
     return text[: text.index("<mujoco")] + ElementTree.tostring(root, encoding="unicode") + "\n"

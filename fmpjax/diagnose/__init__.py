@@ -1,9 +1,9 @@
 """What is wrong with a run, in words: one sentence per symptom, with the figure, its healthy range and where to look.
 
-`RULES` is the one place where the healthy ranges stand; the table in ``docs/metrics.md`` is `page()`. A rule reads a
-`Course`: the rows of ``metrics.csv``, the configuration and one evaluation. The bounds separate the courses that walk
-from those that do not among the 62 below ``experiments/results``, which hold 354 evaluations; `Rule.evidence` names
-them. Where no course shows the fault, the bound lies beyond all that the courses reach, and the evidence says so.
+`RULES` is the one place that has the healthy ranges; the table in ``docs/metrics.md`` is `page()`. A rule reads a
+`Course`: the rows of ``metrics.csv``, the configuration and one evaluation. Among the courses of the preset ``laptop``
+below ``experiments/results``, the bounds separate those that walk from those that do not; `Rule.evidence` names them.
+Where no course shows the fault, the bound lies beyond all that the courses reach, and the evidence says so.
 
 Rules whose figure is missing in a course are not checked, and the report names them.
 """

@@ -57,7 +57,7 @@ class Moments(NamedTuple):
     pushed: jax.Array  # [T, N, D] the same windows, ``PUSH`` faster forward throughout
     speed: jax.Array  # [T, N] m/s, mean forward speed of the window
     reward: jax.Array  # [T, N] under the frozen prior
-    survival: jax.Array  # [T, N] the reward of somebody who only survives: its mean
+    survival: jax.Array  # [T, N] the reward of a policy that only survives: its mean
     batch: ppo.Batch
 
 
@@ -128,7 +128,7 @@ def gradients(trainer: Trainer, state: TrainState, moments: Moments) -> dict[str
     center = moments.survival.mean() / (1.0 - config.discount)
 
     def gradient(advantage, batch):
-        # Where nobody falls, survival has no advantage anywhere.
+        # Where no episode ends by a fall, survival has no advantage anywhere.
         gain = (advantage - advantage.mean()) / jnp.maximum(advantage.std(), 1e-5)
 
         def surrogate(actor):
@@ -166,13 +166,13 @@ def gradients(trainer: Trainer, state: TrainState, moments: Moments) -> dict[str
     return {
         "gradient_agreement": agreement(learned),  # cosine of the gradients of two independent rollouts
         "gradient_survival_cosine": a @ b / jnp.maximum(jnp.linalg.norm(a) * jnp.linalg.norm(b), 1e-12),
-        "return_survival_share": reference.correlation(G, L) ** 2,  # none where nobody falls
+        "return_survival_share": reference.correlation(G, L) ** 2,  # none without a fall
         "critic_explained_variance": 1.0 - jnp.var(G - value.ravel()) / jnp.var(G),
     }
 
 
 def _groups(robot: Robot) -> dict[str, slice]:
-    """Where the quantities stand in a compact frame."""
+    """Where the quantities are in a compact frame."""
     at = FrameLayout.of(robot)
     return {
         "root_position": at.root, "root_rotation": at.rotation, "joint_angles": slice(at.cosine.start, at.sine.stop),

@@ -224,7 +224,7 @@ def _data_set(address: str) -> str:
 
 
 def _endpoint() -> str | None:
-    """Address of the hub where it is not Hugging Face's own; read anew, which the hub's package does not do."""
+    """Address of the hub where it is not Hugging Face's own; read at each call, which the hub's package does not do."""
     return os.environ.get("HF_ENDPOINT") or None
 
 

@@ -114,7 +114,7 @@ def _whole(clip: MotionClip, flips: int) -> dict[str, Figure]:
         Figure("speed", float(np.linalg.norm(np.diff(clip.qpos[:, :2], axis=0), axis=1).mean() * clip.rate)),
         Figure("tilt", float(np.degrees(np.median(np.arccos(np.clip(rotations.up(clip.qpos[:, 3:7]), -1, 1)))))),
         Figure("heading", float(np.degrees(heading(clip))), f"faces {facing:.0f}°"),
-        Figure("turning", turning(clip), f"{np.degrees(spread(clip)):.0f}° at most from the first heading"),
+        Figure("turning", clip.turning, f"{np.degrees(spread(clip)):.0f}° at most from the first heading"),
         Figure("flips", flips, "taken out on reading" if flips else ""),
         Figure("loop gap", float(max(gap, np.abs(last[7:] - target[7:]).max()))),
     )
@@ -159,16 +159,9 @@ def heading(clip: MotionClip) -> float:
     return float(np.arctan2(way[1], way[0]) if np.linalg.norm(way) > WAY else rotations.yaw(clip.qpos[0, 3:7]))
 
 
-def turning(clip: MotionClip) -> float:
-    """Mean rate (rad/s) at which the root's heading turns to the left."""
-    yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
-    return float((yaw[-1] - yaw[0]) / clip.duration)
-
-
 def spread(clip: MotionClip) -> float:
     """Greatest angle (rad) of the root's heading from that of the first sample."""
-    yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
-    return float(np.abs(yaw - yaw[0]).max())
+    return float(np.abs(clip.yaw - clip.yaw[0]).max())
 
 
 def unsuited(robot: Robot, clip: MotionClip, *, axes: str, reset: str, seconds: float) -> list[str]:
@@ -180,7 +173,7 @@ def unsuited(robot: Robot, clip: MotionClip, *, axes: str, reset: str, seconds: 
       seconds: length of an evaluation's episode, s.
     """
     said = []
-    turned, rate, ahead = spread(clip), turning(clip), heading(clip)
+    turned, rate, ahead = spread(clip), clip.turning, heading(clip)
     if axes == "world" and turned > TURNED:
         said.append(
             f"the heading turns by {np.degrees(turned):.0f}° ({rate:.2f} rad/s on average), and windows are in the "

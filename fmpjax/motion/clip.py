@@ -53,6 +53,24 @@ class MotionClip:
         """Time from the first sample to the last, s."""
         return (len(self.qpos) - 1) / self.rate
 
+    @property
+    def yaw(self) -> np.ndarray:
+        """Heading of the root at each sample, ``[T]`` rad, positive to the left, without jumps by a full turn."""
+        return np.unwrap(rotations.yaw(self.qpos[:, 3:7]))
+
+    @property
+    def turning(self) -> float:
+        """Mean rate at which the heading turns, rad/s, positive to the left."""
+        yaw = self.yaw
+        return float(yaw[-1] - yaw[0]) / self.duration
+
+    @property
+    def heading_velocities(self) -> np.ndarray:
+        """Velocity in the own heading at each sample, ``[T, 3]``: m/s ahead, m/s and rad/s to the left."""
+        (vx, vy), yaw = self.qvel[:, :2].T, self.yaw
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        return np.stack([vx * cosine + vy * sine, vy * cosine - vx * sine, np.gradient(yaw) * self.rate], axis=1)
+
     @classmethod
     def from_qpos(cls, name: str, robot: str, rate: float, qpos: np.ndarray) -> "MotionClip":
         """A clip from configurations alone: the root quaternion is made continuous, velocities are differences."""

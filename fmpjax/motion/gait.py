@@ -200,7 +200,12 @@ def _others(robot: Robot) -> str:
 
 
 def _check(robot: Robot, command: Command, rate: float, style: Style) -> None:
-    """Refuse numbers that no walk has."""
+    """Refuse numbers that no walk has, and entries of ``robot.toml`` that would not be read."""
+    if unknown := sorted(set(robot.gait) - {"speed", "joints", *dataclasses.asdict(style)}):
+        raise UserError(
+            f"the [gait] of robot {robot.name!r} has {unknown[0]!r}: expected 'speed', 'joints' and the fields of "
+            "fmpjax.motion.style.Style"
+        )
     own = style.on(robot)
     for name, value, unit in (
         ("the [gait] speed of robot " + repr(robot.name), robot.gait.get("speed", 0.0), "m/s"),
@@ -272,7 +277,7 @@ def _find(robot: Robot, command: Command, rate: float, style: Style, tries: tupl
 
 
 def _highest(robot: Robot, command: Command, found: _Found, fixed: bool) -> _Found | None:
-    """The same with the highest pelvis, to the millimetre, at which the knees are bent enough; None where none is."""
+    """The same with the highest pelvis, to the millimeter, at which the knees are bent enough; None where none is."""
     joints = np.concatenate([Leg(robot, foot).joints for foot in robot.feet])
     bent = 0.0 if fixed else BENT * max(1.0, effort(robot, command)) ** 2
     top = found.style.pelvis_height

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from fmpjax import rotations
 from fmpjax.motion.balance import ground_force
 from fmpjax.motion.clip import MotionClip
 from fmpjax.motion.path import turned
@@ -40,8 +39,7 @@ def measure(robot: Robot, clip: MotionClip, *, contact: float = 0.001) -> dict[s
     names = [f"range_{side}_{joint}" for side in ("left", "right") for joint in ("hip", "knee", "ankle")]
     landings = [np.flatnonzero(down[1:, i] & ~down[:-1, i]) + 1 for i in range(2)]
     strides = sum(max(0, len(at) - 1) for at in landings)
-    yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
-    turn = float(yaw[-1] - yaw[0]) / clip.duration
+    yaw, turn = clip.yaw, clip.turning
     heading = turn * np.arange(len(clip)) / clip.rate
     heading = heading + np.mean((yaw - heading)[:-1])  # the last sample is the first one of another stride
     step = turned(np.diff(clip.qpos[:, :2], axis=0), -(heading[1:] + heading[:-1]) / 2)

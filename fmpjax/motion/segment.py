@@ -96,7 +96,7 @@ def kinds(robot: Robot, clip: MotionClip) -> np.ndarray:
 
     way = mean(clip.qvel[:, :2])
     froude = np.sum(way**2, axis=1) / (9.81 * robot.default_qpos[2])
-    turn = np.abs(mean(np.gradient(np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))) * clip.rate))
+    turn = np.abs(mean(np.gradient(clip.yaw) * clip.rate))
     points, _ = sole_points(robot, clip.qpos)
     lowest = (points[..., 2] - robot.sole_radius).min(axis=1)
     flight = mean(lowest > OFF) > FLIGHT
@@ -134,7 +134,7 @@ def _measured(robot: Robot, clip: MotionClip, first: int, last: int, kind: str, 
     broken = any(" is broken: " in fault for fault in faults)
     speed = float(np.linalg.norm(np.diff(rows[:, :2], axis=0), axis=1).mean() * clip.rate)
     verdict = "broken" if broken else "odd" if faults else "good"
-    turning, fault, found = check.turning(part), faults[0] if faults else "", slice(first, last + 1)
+    turning, fault, found = part.turning, faults[0] if faults else "", slice(first, last + 1)
     return Stretch(found, first + offset, last + offset, kind, part, speed, turning, verdict, fault)
 
 

@@ -147,7 +147,7 @@ class Stride:
         }
         for side, sign in (("left", 1.0), ("right", -1.0)):
             back = sign * forward
-            angles[f"{side}_shoulder_pitch"] = s.arm_centre + s.arm_swing * back
+            angles[f"{side}_shoulder_pitch"] = s.arm_center + s.arm_swing * back
             angles[f"{side}_shoulder_roll"] = sign * s.arm_out
             angles[f"{side}_elbow"] = s.elbow + s.elbow_swing * back
         for part, column in self.parts:

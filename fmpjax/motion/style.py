@@ -43,7 +43,7 @@ class Style:
     torso_yaw: float | None = None  # against the pelvis
     torso_pitch: float | None = None
     arm_swing: float | None = None  # shoulder pitch, each way
-    arm_centre: float | None = None  # shoulder pitch, positive backward
+    arm_center: float | None = None  # shoulder pitch, positive backward
     arm_out: float | None = None  # shoulder roll
     elbow: float | None = None
     elbow_swing: float | None = None

@@ -104,7 +104,7 @@ class NativePhysics:
             )
         before = states[:, -2] if self.substeps > 1 else initial
         reached[:, : nq + nv] = states[:, -1, 1:]
-        # The rollout does not return its solver's last acceleration; the last velocity step stands in.
+        # The rollout does not return its solver's last acceleration; the last velocity step replaces it.
         reached[:, nq + nv :] = (states[:, -1, 1 + nq :] - before[:, 1 + nq :]) / self.model.opt.timestep
 
     def _with_traits(self, rows: np.ndarray) -> list[mujoco.MjModel]:

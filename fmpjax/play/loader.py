@@ -32,7 +32,7 @@ class Loader:
         self._asked.put(player)
 
     def look(self) -> None:
-        """Read again what stands for another policy by now: the best, the newest, the live one."""
+        """Read again the names that now mean another policy: the best, the newest, the live one."""
         for player, (source, name) in enumerate(zip(self._sources, self.names, strict=True)):
             version = source.version(name)
             if version is not None and version != self._versions[player]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from fmpjax import rotations
 from fmpjax.motion import MotionClip
-from fmpjax.sim2sim import Policy, Simulation
+from fmpjax.sim2sim import ExportedPolicy, Simulation
 
 KEPT = 10.0  # s of the past in the plots
 PUSH = 0.1  # s that a push lasts
@@ -73,7 +73,7 @@ class Player:
         """
         self.label, self.simulation, self.clips = label, simulation, clips
         self._in_motion, self._random = in_motion, np.random.default_rng(seed)
-        self._speeds = np.array([heading_velocity(clip) for clip in clips])
+        self._speeds = np.array([clip.heading_velocities.mean(0) for clip in clips])
         self.feet = _feet(simulation)
         self.ghost: Ghost | None = None
         self.drag: Drag | None = None
@@ -84,8 +84,8 @@ class Player:
         self.states: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=64)  # newest last, for the motion prior
         self.restart(np.zeros(3))
 
-    def use(self, policy: Policy) -> None:
-        """Go on with another policy of the same robot."""
+    def use(self, policy: ExportedPolicy) -> None:
+        """Continue with another policy of the same robot."""
         self.simulation.policy = policy
 
     def restart(self, command: np.ndarray, *, here: bool = False) -> None:
@@ -189,14 +189,6 @@ class Player:
                     mujoco.mj_contactForce(model, data, i, force)
                     loads[foot] += force[0]
         return loads
-
-
-def heading_velocity(clip: MotionClip) -> np.ndarray:
-    """A clip's mean velocity in its own heading, ``[3]`` (m/s forward and to the left, rad/s)."""
-    yaw = np.unwrap(rotations.yaw(clip.qpos[:, 3:7]))
-    (vx, vy), cosine, sine = clip.qvel[:, :2].T, np.cos(yaw), np.sin(yaw)
-    turn = (yaw[-1] - yaw[0]) / max(clip.duration, 1e-6)
-    return np.array([(vx * cosine + vy * sine).mean(), (vy * cosine - vx * sine).mean(), turn])
 
 
 def moved(qpos: np.ndarray, start: np.ndarray, place: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from fmpjax.errors import UserError
 from fmpjax.play.player import Drag, Player
-from fmpjax.sim2sim import Policy
+from fmpjax.sim2sim import ExportedPolicy
 
 BEHIND = 0.25  # s by which the simulation may be behind before it lets that time go
 DEFAULT_COMMANDS = np.array([[-0.5, -0.3, -0.8], [1.0, 0.3, 0.8]])  # of a policy that does not say what it may be told
@@ -92,8 +92,8 @@ class Session:
         with self._lock:
             self.pace = float(np.clip(pace, SLOWEST, 1.0))
 
-    def use(self, player: int, policy: Policy) -> None:
-        """Go on with another policy of the same robot.
+    def use(self, player: int, policy: ExportedPolicy) -> None:
+        """Continue with another policy of the same robot.
 
         Raises:
           UserError: it is of another robot, or acts at another rate.

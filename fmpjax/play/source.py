@@ -34,7 +34,7 @@ class Source(Protocol):
         """What changes when the name stands for another policy; None where there is none of that name."""
         ...
 
-    def load(self, name: str) -> sim2sim.Policy:
+    def load(self, name: str) -> sim2sim.ExportedPolicy:
         """Read a policy.
 
         Raises:
@@ -42,7 +42,7 @@ class Source(Protocol):
         """
         ...
 
-    def player(self, learned: sim2sim.Policy) -> Player:
+    def player(self, learned: sim2sim.ExportedPolicy) -> Player:
         """A robot that a policy moves."""
         ...
 
@@ -80,7 +80,7 @@ class RunSource:
         self._scored = False
 
     def names(self) -> list[str]:
-        """Best, newest and live, as far as there are such, then the iterations of the checkpoints, the last first."""
+        """Best, newest and live, if they exist, then the iterations of the checkpoints, the last first."""
         numbers = _numbers(self.folder / "checkpoints")
         live = (self.folder / policy.LIVE).is_file()
         kinds = ((BEST, _numbers(self.folder / "best")), (NEWEST, numbers), (LIVE, live))
@@ -96,7 +96,7 @@ class RunSource:
         except (OSError, IndexError, KeyError):
             return None
 
-    def load(self, name: str) -> sim2sim.Policy:
+    def load(self, name: str) -> sim2sim.ExportedPolicy:
         """Read a policy; the names are those of `names` and no others, so that no name leads out of the folder."""
         version = self.version(name)
         if version is None:
@@ -106,7 +106,7 @@ class RunSource:
             return read_npz(self.folder / policy.LIVE)
         return read_npz(self._reader.policy(int(version), best=name == BEST))
 
-    def player(self, learned: sim2sim.Policy) -> Player:
+    def player(self, learned: sim2sim.ExportedPolicy) -> Player:
         """A robot in the physics of the training."""
         physics = self.config.physics
         model = copy.copy(self.robot.model)
@@ -157,13 +157,13 @@ class FileSource:
         """A file does not change."""
         return "" if name == self.path.name else None
 
-    def load(self, name: str) -> sim2sim.Policy:
+    def load(self, name: str) -> sim2sim.ExportedPolicy:
         """Read the file."""
         if name != self.path.name:
             raise UserError(f"{self.path.parent} has no policy {name!r}: expected {self.path.name}")
         return read_npz(self.path) if self.path.suffix == ".npz" else sim2sim.load(self.path)
 
-    def player(self, learned: sim2sim.Policy) -> Player:
+    def player(self, learned: sim2sim.ExportedPolicy) -> Player:
         """A robot on the model that was named, or on that of the training."""
         if self._model is not None:
             return Player(self.label, sim2sim.Simulation(learned, self._model))
@@ -212,7 +212,7 @@ def of(path: Path, *, name: str | None = None, model: Path | None = None) -> Run
     return FileSource(path, model)
 
 
-def read_npz(path: Path) -> sim2sim.Policy:
+def read_npz(path: Path) -> sim2sim.ExportedPolicy:
     """A policy that NumPy runs.
 
     Raises:

@@ -2,8 +2,8 @@
 
 A discriminator sees the difference between the demonstration's frame at the commanded time and the robot's. Its only
 positive sample is the zero vector: a step without any error. Its negative samples are the differences of the policy,
-present and replayed, and the gradient penalty stands on these alone. Each coordinate is divided by the running mean of
-its magnitude, so no weights between errors have to be chosen. The reward is AMP's.
+present and replayed, and the gradient penalty is taken at these alone. Each coordinate is divided by the running mean
+of its magnitude, so no weights between errors have to be chosen. The reward is AMP's.
 
 Frames are FMP's, without x and y and in the axes of its features. Only the newest frame is compared, as in MimicKit.
 """

@@ -15,7 +15,7 @@ from flax import linen
 
 from fmpjax import learning, sharding
 from fmpjax.config import AdversaryConfig
-from fmpjax.priors.base import Expert, Metrics, MotionPrior, Rollout, flatten
+from fmpjax.priors.base import Expert, Metrics, MotionPrior, Rollout, flatten, known_reward
 
 
 class Normalizer(NamedTuple):
@@ -97,7 +97,7 @@ def cross_entropy(
 ):
     """Cross entropy, gradient penalty and logit penalty at normalized windows; and statistics.
 
-    The gradient penalty stands on ``both`` sides, or on the policy's alone.
+    The gradient penalty is taken on ``both`` sides, or on the policy's alone.
     """
 
     def logits_and_slopes(x):
@@ -152,7 +152,7 @@ def make(expert: Expert, settings: AdversaryConfig, loss: Loss, follow: Follow =
         learning.direction(settings.optimizer, settings.momentum),
         optax.scale(-settings.learning_rate),
     )
-    # A feature over its weight is a standardized coordinate. Coordinates that stand twice in the full window stand once
+    # A feature over its weight is a standardized coordinate. Coordinates that are twice in the full window are once
     # here, root two times as large, so that the gradient penalty is the full window's.
     multiplicity = jnp.sqrt(expert.dimension) * expert.weight
 
@@ -234,7 +234,7 @@ def discriminator(
         pool = flatten(rollout, expert.windows[0])
         logits = adversary.score(state, pool)
         reward = reward_of(logits).reshape(rollout.valid.shape)
-        reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
+        reward = known_reward(reward, rollout.valid)
         state, summary = adversary.fit(state, pool, logits, key)
         return state, reward, summary
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from fmpjax import learning, sharding, transport
 from fmpjax.config import Config, PriorConfig
 from fmpjax.frames import PLANAR
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, flatten, known_reward
 
 
 class BarycentricState(NamedTuple):
@@ -95,7 +95,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         state = BarycentricState(condition, successor, dual, epsilon)
         scores = score(state, pool)
         reward = 2.0 * jnp.exp(scores).reshape(rollout.valid.shape)
-        reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
+        reward = known_reward(reward, rollout.valid)
         _, probability = target(state, split(source, expert.horizon)[0])
         summary = {
             **learning.score_metrics(*learning.median_and_spread(scores)),

@@ -160,4 +160,9 @@ def median_reward(score: Float[jax.Array, "*shape"], valid: Bool[jax.Array, "*sh
     """Reward 2 sigmoid((S - median) / max(IQR, floor)) over the rollout's valid windows (eq. reward), 0 elsewhere."""
     median, spread = learning.median_and_spread(jnp.where(valid, score, jnp.nan), jnp.nanquantile)
     reward = 2.0 * jax.nn.sigmoid((score - median) / jnp.maximum(spread, spread_floor))
-    return Reward(jnp.where(valid & jnp.isfinite(reward), reward, 0.0), median, spread)
+    return Reward(known_reward(reward, valid), median, spread)
+
+
+def known_reward(reward: Float[jax.Array, "*shape"], valid: Bool[jax.Array, "*shape"]) -> Float[jax.Array, "*shape"]:
+    """The reward, and 0 for steps that are not valid or whose reward is not finite."""
+    return jnp.where(valid & jnp.isfinite(reward), reward, 0.0)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from fmpjax import learning, sharding, transport
 from fmpjax.config import Config
-from fmpjax.priors.base import Expert, MotionPrior, Rollout
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, known_reward
 
 
 class PWILState(NamedTuple):
@@ -93,7 +93,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         scores = exponent(cost)
         reward = settings.scale * jnp.exp(scores)
         # A step that finds too little mass earns nothing: what it moved does not tell how far off it is.
-        reward = jnp.where(rollout.valid & (left == 0) & jnp.isfinite(reward), reward, 0.0)
+        reward = known_reward(reward, rollout.valid & (left == 0))
         summary = {
             **learning.score_metrics(*learning.median_and_spread(scores)),
             "coupling_distance": cost.mean() / step_mass,

@@ -5,7 +5,7 @@ update. The state holds the iteration, so a run that resumes does not pretrain a
 the noise that the model finds in a noised window, relative to the mean error of the policy's windows so far.
 
 Where this departs from the source: windows are FMP's, with joint velocities and at the control rate, standardized by
-FMP's deviations, and ``smp.network`` may be ``small``. Coordinates that stand twice in the full window count once. The
+FMP's deviations, and ``smp.network`` may be ``small``. Coordinates that are twice in the full window count once. The
 running mean includes the rollout that is scored.
 """
 
@@ -19,7 +19,7 @@ from flax import linen
 
 from fmpjax import learning, sharding
 from fmpjax.config import SMP_NETWORKS, Config
-from fmpjax.priors.base import Expert, MotionPrior, Pretraining, Rollout, flatten
+from fmpjax.priors.base import Expert, MotionPrior, Pretraining, Rollout, flatten, known_reward
 
 # Settings on which the pretrained model depends.
 PRETRAINED_BY = (
@@ -177,7 +177,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
         )
         scores = exponent(state, error)
         reward = settings.scale * jnp.exp(scores).reshape(rollout.valid.shape)
-        reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
+        reward = known_reward(reward, rollout.valid)
         summary = {
             **learning.score_metrics(*learning.median_and_spread(scores), exponent(state, demonstration)),
             "pretraining_loss": state.loss,

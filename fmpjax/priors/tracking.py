@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from fmpjax import learning
 from fmpjax.config import Config, TrackingConfig
 from fmpjax.frames import FrameLayout
-from fmpjax.priors.base import Expert, MotionPrior, Rollout, followed, unscored
+from fmpjax.priors.base import Expert, MotionPrior, Rollout, followed, known_reward, unscored
 
 
 class Errors(NamedTuple):
@@ -85,7 +85,7 @@ def make(expert: Expert, config: Config) -> MotionPrior:
     def update(state, rollout: Rollout, key):
         found = errors(*followed(rollout), layout)
         reward = reward_of(found, settings)
-        reward = jnp.where(rollout.valid & jnp.isfinite(reward), reward, 0.0)
+        reward = known_reward(reward, rollout.valid)
         known = jnp.maximum(rollout.valid.sum(), 1)
         # States that are not finite count as errors of zero in these sums.
         summary = {

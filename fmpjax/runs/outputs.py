@@ -196,7 +196,7 @@ def course_video(
     course: Sequence[tuple[float, tuple[float, float, float]]],
     path: Path | None,
 ) -> Path:
-    """The policy under a course of commanded velocities, which stand in the picture; the path written.
+    """The policy under a course of commanded velocities, which the picture shows; the path written.
 
     Args:
       run: whose command is a velocity.
@@ -208,8 +208,7 @@ def course_video(
     Raises:
       UserError: the run's command is no velocity, or the file cannot be written.
     """
-    if trainer.config.command.kind != "velocity":
-        raise UserError(f"the run's command.kind is {trainer.config.command.kind!r}: expected 'velocity' for a course")
+    trainer.config.command.require("velocity")
     rate, stride = trainer.config.control_rate, 2  # 25 pictures a second
     told = np.concatenate([np.tile(command, (max(1, round(seconds * rate)), 1)) for seconds, command in course])
     played = steering.play(trainer, state.ppo, told[:, None], np.random.default_rng(0))

@@ -6,7 +6,7 @@ contacts. Its servos get the policy's gains and torque limits, unless it is to k
 """
 
 from fmpjax.sim2sim.episodes import COURSE, Course, Episode, course, play, report
-from fmpjax.sim2sim.exported import Policy, load, read
+from fmpjax.sim2sim.exported import ExportedPolicy, load, read
 from fmpjax.sim2sim.observation import TERMS
 from fmpjax.sim2sim.simulation import Simulation
 from fmpjax.sim2sim.traits import FACTS, facts, integrator
@@ -17,7 +17,7 @@ __all__ = [
     "TERMS",
     "Course",
     "Episode",
-    "Policy",
+    "ExportedPolicy",
     "Simulation",
     "course",
     "facts",

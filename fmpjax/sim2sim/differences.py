@@ -3,12 +3,12 @@
 import mujoco
 import numpy as np
 
-from fmpjax.sim2sim.exported import Policy
+from fmpjax.sim2sim.exported import ExportedPolicy
 from fmpjax.sim2sim.traits import FACTS, facts, integrator
 
 
 def differences(
-    policy: Policy, model: mujoco.MjModel, ids: list[int], servos: np.ndarray, root: int, substeps: int
+    policy: ExportedPolicy, model: mujoco.MjModel, ids: list[int], servos: np.ndarray, root: int, substeps: int
 ) -> list[str]:
     """Sentences on what a model has unlike the policy's training.
 
@@ -25,7 +25,7 @@ def differences(
     if abs(mass - policy.total_mass) > 1e-3:
         said.append(f"mass {mass:.3f} kg, in training {policy.total_mass:.3f} kg")
     if ids != sorted(ids):
-        said.append("joints stand in another order; they are found by name")
+        said.append("the joints are in another order; they are found by name")
     moved = set(ids)
     others = [j for j in range(model.njnt) if j not in moved and model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
     if others:
@@ -56,7 +56,7 @@ def differences(
 
 
 def _unlike(
-    policy: Policy, what: str, where: np.ndarray, here: np.ndarray, trained: np.ndarray, unit: str
+    policy: ExportedPolicy, what: str, where: np.ndarray, here: np.ndarray, trained: np.ndarray, unit: str
 ) -> list[str]:
     """A sentence on the joints that differ, with the first of them."""
     found = np.flatnonzero(where)
@@ -67,7 +67,9 @@ def _unlike(
     return [f"{what} of {len(found)} joints, such as {policy.joint_names[first]}: {a} {unit}, in training {b} {unit}"]
 
 
-def _apart(policy: Policy, words: str, unit: str, tolerance: float, here: np.ndarray, trained: np.ndarray) -> list[str]:
+def _apart(
+    policy: ExportedPolicy, words: str, unit: str, tolerance: float, here: np.ndarray, trained: np.ndarray
+) -> list[str]:
     """A sentence on the joints whose numbers ``[J]`` or vectors ``[J, 3]`` differ, with the one that does most."""
     apart = np.abs(here - trained) if here.ndim == 1 else np.linalg.norm(here - trained, axis=-1)
     if not (apart > tolerance).any():

@@ -12,7 +12,7 @@ from fmpjax.sim2sim.observation import TERMS
 from fmpjax.sim2sim.traits import FACTS
 
 
-class Policy(NamedTuple):
+class ExportedPolicy(NamedTuple):
     """A policy with what its file says of it; ``J`` joints."""
 
     act: Callable[[np.ndarray], np.ndarray]  # observation [O] -> actions [J]
@@ -41,7 +41,7 @@ class Policy(NamedTuple):
     commands: np.ndarray | None = None  # [2, 3] lowest and highest velocity that it may be told (m/s, m/s, rad/s)
 
 
-def load(path: str | Path) -> Policy:
+def load(path: str | Path) -> ExportedPolicy:
     """Read an exported policy.
 
     Raises:
@@ -76,7 +76,7 @@ def read(
     said: Mapping[str, str],
     act: Callable[[np.ndarray], np.ndarray],
     shapes: tuple[Sequence[int], Sequence[int]],
-) -> Policy:
+) -> ExportedPolicy:
     """A policy from the metadata of its file.
 
     Args:
@@ -92,7 +92,7 @@ def read(
     try:
         _check_plain(said)
         widths = map(int, said["observation_widths"].split(","))
-        policy = Policy(
+        policy = ExportedPolicy(
             act=act,
             terms=dict(zip(said["observation_names"].split(","), widths, strict=True)),
             history=_history(said),
@@ -173,7 +173,7 @@ def _history(said: Mapping[str, str]) -> int:
     return max(1, int(lengths.pop()))
 
 
-def _check(path: str | Path, policy: Policy, shapes: tuple[Sequence[int], Sequence[int]]) -> None:
+def _check(path: str | Path, policy: ExportedPolicy, shapes: tuple[Sequence[int], Sequence[int]]) -> None:
     joints, size = len(policy.joint_names), sum(policy.terms.values())
     for name in policy.terms:
         if name not in TERMS:

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from fmpjax.errors import UserError
-from fmpjax.sim2sim.exported import Policy
+from fmpjax.sim2sim.exported import ExportedPolicy
 from fmpjax.sim2sim.traits import integrator
 
 _HINGE = mujoco.mjtJoint.mjJNT_HINGE
@@ -26,7 +26,7 @@ def check_servos(model: mujoco.MjModel, servos: dict[str, int | None], path: str
             raise UserError(f"{path} has no position servo on {name}: expected one per joint with --gains model")
 
 
-def prepared(policy: Policy, path: str | Path, own_gains: bool) -> tuple[mujoco.MjModel, list[str]]:
+def prepared(policy: ExportedPolicy, path: str | Path, own_gains: bool) -> tuple[mujoco.MjModel, list[str]]:
     """The model in a file with the policy's servos and a floor, and sentences on what was added.
 
     Raises:
@@ -42,7 +42,7 @@ def prepared(policy: Policy, path: str | Path, own_gains: bool) -> tuple[mujoco.
         raise UserError(f"{path} cannot be read as MJCF: {' '.join(str(error).split())}") from None
 
 
-def prepare(spec: mujoco.MjSpec, policy: Policy, path: str | Path, own_gains: bool) -> list[str]:
+def prepare(spec: mujoco.MjSpec, policy: ExportedPolicy, path: str | Path, own_gains: bool) -> list[str]:
     """Give the policy's joints its servos unless ``own_gains``, and the world a floor; sentences on what was added.
 
     Servos of MuJoCo apply the torque of the gains; its implicit integrators know their damping, as in training.

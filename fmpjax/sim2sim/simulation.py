@@ -8,7 +8,7 @@ import numpy as np
 
 from fmpjax.errors import UserError
 from fmpjax.sim2sim.differences import differences
-from fmpjax.sim2sim.exported import Policy
+from fmpjax.sim2sim.exported import ExportedPolicy
 from fmpjax.sim2sim.model import check_servos, drives_joint, prepared
 from fmpjax.sim2sim.observation import TERMS
 
@@ -23,7 +23,7 @@ class Simulation:
 
     def __init__(
         self,
-        policy: Policy,
+        policy: ExportedPolicy,
         path: str | Path,
         *,
         own_gains: bool = False,
@@ -76,7 +76,7 @@ class Simulation:
             self.differences.append(f"the soles reach lower: the start is raised by {1e3 * self.raised:.1f} mm")
 
     def _body(self, place: dict[str, Any], path: str | Path) -> int:
-        """Index of a body: its hinge finds it, whatever the model calls it."""
+        """Index of a body: found by its hinge, since models name bodies differently."""
         if place["joint"] is not None:
             return int(self.model.joint(place["joint"]).bodyid[0])
         found = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, place["body"])

@@ -11,7 +11,7 @@ from fmpjax.errors import UserError
 
 
 class Line(NamedTuple):
-    """A curve; labels that several panels share stand in the legend once."""
+    """A curve; labels that several panels share are in the legend once."""
 
     x: Sequence[float]
     y: Sequence[float]

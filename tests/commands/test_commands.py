@@ -52,7 +52,7 @@ def test_a_clips_velocity_is_in_its_own_heading(robot):
 def test_a_frames_velocity_is_in_the_heading_frame(robot, slow_and_left):
     clip = slow_and_left.clips[1]
     frame = features.observe(robot, jnp.asarray(clip.qpos[100]), jnp.asarray(clip.qvel[100]), "compact").frame
-    np.testing.assert_allclose(velocity.heading_velocity(frame, FrameLayout.of(robot)), [1.0, 0.0, 0.5], atol=0.01)
+    np.testing.assert_allclose(FrameLayout.of(robot).heading_velocity(frame), [1.0, 0.0, 0.5], atol=0.01)
 
 
 def test_commands_are_demonstrations_velocities_or_between_two(robot, slow_and_left):

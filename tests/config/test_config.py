@@ -187,6 +187,12 @@ def test_networks_of_the_diffusion_model_are_its_choices():
     assert set(configuration.SMP_NETWORKS) == set(typing.get_args(reading.types(configuration.SMPConfig)["network"]))
 
 
+def test_a_command_of_another_kind_is_refused():
+    configuration.CommandConfig(kind="phase").require("phase")
+    with pytest.raises(UserError, match="^the run's command.kind is 'none': expected 'phase'$"):
+        configuration.CommandConfig().require("phase")
+
+
 # --- explanations ----------------------------------------------------------------------------------------------------
 
 
@@ -201,8 +207,9 @@ def test_every_setting_has_a_meaning_and_a_known_source():
 
 def test_a_meaning_is_the_comment_of_the_class_that_sets_the_default():
     known = explaining.settings()
-    assert known["env.count"].meaning == "parallel environments [P]"
-    assert known["evaluations"].meaning.startswith("shares of the budget at which to evaluate [P]")  # it stands above
+    assert known["env.count"].meaning == "number of parallel environments [P]"
+    above = "shares of the budget at which the policy is evaluated [P]"
+    assert known["evaluations"].meaning.startswith(above)
     assert known["wail.updates"].meaning != known["amp.updates"].meaning == known["gail.updates"].meaning
     assert known["prior.updates"].values == {"paper": 128, "robot": 3, "robust": 3, "laptop": 3, "smoke": 2}
 
@@ -210,7 +217,7 @@ def test_a_meaning_is_the_comment_of_the_class_that_sets_the_default():
 def test_a_section_or_a_setting_is_explained(capsys):
     cli.main(["settings", "pwil"])
     printed = capsys.readouterr().out
-    assert "pwil.scale = 5.0\n    alpha, the reward of a perfect step [L]\n    a number above 0\n" in printed
+    assert "pwil.scale = 5.0\n    alpha, reward of a perfect step [L]\n    a number above 0\n" in printed
     assert "[L] PWIL" in printed and "ppo." not in printed
     cli.main(["settings", "env.count"])
     printed = capsys.readouterr().out

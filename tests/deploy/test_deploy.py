@@ -383,7 +383,7 @@ def test_the_first_steps_are_those_of_training(trained, robot, tmp_path, edit):
         assert not sim.step()
         np.testing.assert_allclose(np.concatenate([sim.qpos, sim.qvel]), state, atol=1e-5)
     said = {
-        in_another_order: "joints stand in another order",
+        in_another_order: "the joints are in another order",
         without_a_floor: "no floor: one was added",
         without_a_mesh: "1 mesh files are missing, such as lost.stl: their shapes are left out",
     }

@@ -63,7 +63,7 @@ def test_mirrored_key_points_are_reflections(robot, lively):
     plain, image = places(lively), places(edit.mirrored(robot, lively))
     for name, at in plain.items():
         partner = name.replace("left", "?").replace("right", "left").replace("?", "right")
-        # The maker's model is symmetric to a hundredth of a millimetre in the arms, a millimetre in the torso's chain.
+        # The maker's model is symmetric to a hundredth of a millimeter in the arms, a millimeter in the torso's chain.
         np.testing.assert_allclose(image[partner], at * [1, -1, 1], atol=5e-4)
 
 
@@ -268,7 +268,7 @@ def test_not_a_number_is_broken():
 
 
 def test_torques_of_a_crouch_are_those_of_statics(robot):
-    """Moment about the knee of half the weight, under the mass centre, less that of shank and foot."""
+    """Moment about the knee of half the weight, under the center of mass, less that of shank and foot."""
     crouch, index = robot.default_qpos.copy(), robot.joint_names.index
     for side in ("left", "right"):
         for joint, angle in (("hip_pitch", -0.7), ("knee", 1.2), ("ankle_pitch", -0.5)):

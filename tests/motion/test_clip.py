@@ -51,6 +51,15 @@ def test_resampling_constant_motion_is_exact(source, rate):
     np.testing.assert_allclose(out, moving(rate, len(out), axis=axis), atol=1e-12)
 
 
+def test_a_clip_tells_its_velocity_in_its_own_heading():
+    spinning = MotionClip.from_qpos("spin", "unitree_g1", 50.0, moving(50.0, 500))  # through more than a full turn
+    yaw = 0.7 * np.arange(500) / 50.0
+    np.testing.assert_allclose(spinning.yaw, yaw, atol=1e-9)
+    assert spinning.turning == pytest.approx(0.7)
+    ahead, left = 0.9 * np.cos(yaw) + 0.2 * np.sin(yaw), 0.2 * np.cos(yaw) - 0.9 * np.sin(yaw)
+    np.testing.assert_allclose(spinning.heading_velocities, np.stack([ahead, left, 0.7 + 0 * yaw], axis=1), atol=1e-9)
+
+
 def test_last_sample_on_the_grid_is_kept():
     out = motion.resample(moving(30.0, 211), 30.0, 50.0)
     assert len(out) == 351

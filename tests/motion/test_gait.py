@@ -72,7 +72,7 @@ def test_every_stride_is_the_first_one_moved_on(walk):
 
 def test_right_leg_mirrors_the_left_one(robot, walk):
     left, right = (walk.qpos[:, 7 + robot.sagittal_joints[side]] for side in (slice(0, 3), slice(3, 6)))
-    # The arms' and trunk's masses are not quite symmetric, which moves the pelvis by less than a millimetre.
+    # The arms' and trunk's masses are not quite symmetric, which moves the pelvis by less than a millimeter.
     np.testing.assert_allclose(right[STRIDE // 2 : STRIDE], left[: STRIDE // 2], atol=5e-3)
 
 
@@ -215,8 +215,8 @@ def turning():
 
 
 @pytest.fixture(scope="module")
-def centre(turning):
-    """Centre of the path: the point about which a stride turns."""
+def center(turning):
+    """Center of the path: the point about which a stride turns."""
     start, end = turning.qpos[0, :2], turning.qpos[STRIDE, :2]
     angle = 0.5 * STRIDE / 50
     c, s = np.cos(angle), np.sin(angle)
@@ -224,23 +224,23 @@ def centre(turning):
     return np.linalg.solve(np.eye(2) - rotation, end - rotation @ start)
 
 
-def test_every_turning_stride_is_the_first_one_turned(turning, centre):
+def test_every_turning_stride_is_the_first_one_turned(turning, center):
     turn_wxyz = rotations.exp_map(np.array([0.0, 0.0, 0.5 * STRIDE / 50]))
     first, later = turning.qpos[:STRIDE], turning.qpos[STRIDE : 2 * STRIDE]
-    middle = np.append(centre, 0.0)
+    middle = np.append(center, 0.0)
     np.testing.assert_allclose(later[:, :3], middle + rotations.rotate(turn_wxyz, first[:, :3] - middle), atol=1e-9)
     np.testing.assert_allclose(np.abs(np.sum(later[:, 3:7] * rotations.multiply(turn_wxyz, first[:, 3:7]), axis=1)), 1)
     np.testing.assert_allclose(later[:, 7:], first[:, 7:], atol=1e-9)
 
 
-def test_feet_stand_on_arcs_beside_the_path(robot, turning, centre):
+def test_feet_stand_on_arcs_beside_the_path(robot, turning, center):
     """Path of 0.7 m/s at 0.5 rad/s to the left: 1.4 m around; each foot stands half the width inside or outside."""
     data = mujoco.MjData(robot.model)
     left, right = dict.fromkeys((robot.sole_body + 1).tolist())
     for at, foot, radius in ((STRIDE // 4, left, 1.4 - 0.085), (STRIDE * 3 // 4, right, 1.4 + 0.085)):
         data.qpos[:] = turning.qpos[at]
         mujoco.mj_kinematics(robot.model, data)
-        assert np.linalg.norm(data.xpos[foot, :2] - centre) == pytest.approx(radius, abs=1e-4)
+        assert np.linalg.norm(data.xpos[foot, :2] - center) == pytest.approx(radius, abs=1e-4)
 
 
 def test_right_turn_mirrors_the_left_one(robot, turning):
@@ -252,7 +252,7 @@ def test_right_turn_mirrors_the_left_one(robot, turning):
     np.testing.assert_allclose(joints[1][half:STRIDE, left], joints[0][:half, right], atol=5e-3)
 
 
-def test_ground_pushes_toward_the_centre(robot, turning, centre):
+def test_ground_pushes_toward_the_center(robot, turning, center):
     """Over a stride the push, seen from the walker, is the weight and what holds the mass on its circle."""
     period = STRIDE / 50
     _, force = balance.ground_force(robot, turning.qpos[:STRIDE], 50.0, np.array([0.7 * period, 0.0]), 0.5 * period)
@@ -260,7 +260,7 @@ def test_ground_pushes_toward_the_centre(robot, turning, centre):
     for i, row in enumerate(turning.qpos[:STRIDE]):
         data.qpos[:] = row
         mujoco.mj_forward(robot.model, data)
-        inward[i, :2] = centre - data.subtree_com[1, :2]
+        inward[i, :2] = center - data.subtree_com[1, :2]
     expected = robot.total_mass * 0.5**2 * np.mean(np.linalg.norm(inward, axis=1))
     inward /= np.linalg.norm(inward, axis=1, keepdims=True)
     assert np.mean(np.sum(force * inward, axis=1)) == pytest.approx(expected, rel=0.05)

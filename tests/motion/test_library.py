@@ -215,7 +215,7 @@ def test_the_expert_bank_and_single_draws_follow_the_weights(two):
     assert drawn.shape == (100, 200, 1) and abs((drawn < 21).mean() - 0.8) < 0.01
 
 
-def test_features_are_standardised_by_weight(robot, two, env):
+def test_features_are_standardized_by_weight(robot, two, env):
     """A weight of eight to two is as good as repeating windows until they are eight to two."""
     windows = env.clip_windows()
     weighed = features.fit_feature_map(robot, windows, FeatureConfig(), two.share_after(HORIZON - 1))

@@ -20,8 +20,8 @@ from fmpjax.config import preset
 from fmpjax.errors import UserError
 from fmpjax.play import server as serving
 from fmpjax.play.devices import Gamepad, Keyboard
-from fmpjax.play.player import Drag, Player, heading_velocity, moved
-from fmpjax.sim2sim import Policy
+from fmpjax.play.player import Drag, Player, moved
+from fmpjax.sim2sim import ExportedPolicy
 
 HOLD = np.array([[-0.5, 0.0, -0.8], [1.0, 0.0, 0.8]])  # what the test's policies may be told
 
@@ -66,7 +66,7 @@ def said(robot, terms, *, rate=50.0, joints=None):
     }
 
 
-def standing(robot, *, steered=True, **changes) -> Policy:
+def standing(robot, *, steered=True, **changes) -> ExportedPolicy:
     """A policy that holds the default pose; its second observation is what it was told."""
     terms = {"root_height": 1} | ({"velocity_commands": 3} if steered else {})
     size = sum(terms.values())
@@ -122,7 +122,7 @@ def test_a_push_gives_the_robot_its_impulse(robot, session):
     np.testing.assert_allclose(velocity[:2], np.array([-10.0, 20.0]) / robot.total_mass, atol=0.02)
 
 
-def test_a_hand_pulls_towards_the_pointer(session):
+def test_a_hand_pulls_toward_the_pointer(session):
     sim = session.players[0].simulation
     before = sim.qpos[0]
     body = sim.root_body
@@ -263,7 +263,7 @@ def test_a_configuration_is_moved_over_the_floor_and_turned(walk):
 def test_the_demonstration_that_moves_like_the_command_goes_along(robot):
     clips = tuple(motion.load(name) for name in ("walk", "turn_left"))
     one = player(robot, clips=clips)
-    fast, turning = map(heading_velocity, clips)
+    fast, turning = (clip.heading_velocities.mean(0) for clip in clips)
     one.restart(fast)
     assert one.ghost.clip is clips[0]
     np.testing.assert_allclose(one.ghost.qpos(), one.simulation.qpos, atol=1e-9)

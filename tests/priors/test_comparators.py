@@ -155,7 +155,7 @@ def phases(epsilon_fraction):
 
 
 @pytest.mark.parametrize("epsilon_fraction", [0.1, 1.0, 20.0])
-def test_barycentre_matches_on_the_history_and_scores_the_successor(epsilon_fraction):
+def test_barycenter_matches_on_the_history_and_scores_the_successor(epsilon_fraction):
     """Two phases in closed form.
 
     Costs between like histories are 0 and between unlike ones 2. In a balanced pool the duals are equal, so a window of
@@ -183,7 +183,7 @@ def test_barycentre_matches_on_the_history_and_scores_the_successor(epsilon_frac
     np.testing.assert_allclose(prior.score(state, queries), expected, atol=0.02)
 
 
-def test_barycentre_prefers_the_mean_motion_where_matching_is_diffuse():
+def test_barycenter_prefers_the_mean_motion_where_matching_is_diffuse():
     """What the paper holds against it: with diffuse matching, the standstill between two phases earns the most."""
     prior, windows, window = phases(20.0)
     points = np.tile(windows, (STEPS * COUNT // 32, 1))

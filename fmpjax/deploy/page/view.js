@@ -6,7 +6,7 @@ import { OrbitControls } from "./lib/three/OrbitControls.js";
 const [PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX] = [0, 2, 3, 4, 5, 6]; // MuJoCo's types of shapes
 const SKY = 0xd5dee6;
 const LOOKS = 3; // groups below this one are shown, as in MuJoCo's own viewer
-const NEWTONS = 100; // a metre of the arrow that shows a push
+const NEWTONS = 100; // a meter of the arrow that shows a push
 
 export class View {
   constructor(canvas, sim) {

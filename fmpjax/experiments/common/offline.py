@@ -154,7 +154,7 @@ def fit(
 
 
 class Layout(NamedTuple):
-    """Where the queries of a study stand in one batch."""
+    """Where the queries of a study are in one batch."""
 
     held_out: slice
     paths: tuple[slice, ...]  # a slice a fraction

@@ -317,7 +317,7 @@ def verdicts(final: Sequence[Row]) -> list[Verdict]:
             Verdict(
                 "FMP walks faster than AMP from demonstration resets",
                 f"{_pace(fmp)} against {_pace(amp)}",
-                # Where nobody lasts five seconds there is no late speed, which any speed is more than.
+                # Where no episode lasts five seconds there is no late speed; any speed is more than none.
                 not math.isnan(fmp["late_speed"]) and not amp["late_speed"] >= fmp["late_speed"],
             )
         )

@@ -1,7 +1,7 @@
 """MimicKit's ``.pkl``: ``fps``, ``loop_mode`` and ``frames [T, 3 + 3 + J]``.
 
 A frame is the root position (m), the root rotation as a rotation vector (axis times angle, rad) and the joints (rad) in
-the model's order. With a ``loop_mode`` of 1 the motion goes on from its last frame at its first.
+the model's order. With a ``loop_mode`` of 1 the motion continues from its last frame to its first.
 """
 
 from collections.abc import Mapping

@@ -42,7 +42,7 @@ class Recording(NamedTuple):
     qpos: np.ndarray  # [T, 7 + J] root xyz m, root quaternion wxyz, joints rad
     rate: float  # Hz
     reading: Reading
-    loops: bool = False  # the file says that its end goes on at its start
+    loops: bool = False  # the file says that its end continues at its start
 
 
 class Columns(NamedTuple):
