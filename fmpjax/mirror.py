@@ -34,11 +34,6 @@ class Mirror(NamedTuple):
     observation: Reflection
     action: Reflection
 
-    @property
-    def spread(self) -> Reflection:
-        """Of the deviations of actions."""
-        return Reflection(self.action.order, np.abs(self.action.sign), np.zeros_like(self.action.shift))
-
 
 def make(robot: Robot, form: str, actions: ActionMap) -> Mirror:
     """The mirror images for a robot whose policy observes ``form``, as `features.observation_form` gives it.

@@ -195,7 +195,7 @@ class PPO:
         return_variance = returns.var()
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), sharding.gather((batch, returns, gain)))
         if self.mirror is not None:
-            flat = (_mirrored(flat[0], self.mirror, jax.random.fold_in(key, 0)), *flat[1:])
+            flat = (self._mirrored(flat[0], self.mirror, state, jax.random.fold_in(key, 0)), *flat[1:])
         critic_key, actor_key = jax.random.split(key)
 
         def critic_loss(params, sample):
@@ -262,6 +262,18 @@ class PPO:
         }
         return new_state, metrics
 
+    def _mirrored(self, samples: Batch, mirror: Mirror, state: PPOState, key: jax.Array) -> Batch:
+        """Samples ``[n, ...]``, each with probability 1/2 as its mirror image; returns and advantages are the same."""
+        chosen = jax.random.bernoulli(key, shape=samples.reward.shape)[..., None]
+        observation, action = (
+            jnp.where(chosen, image(x), x)
+            for image, x in zip(mirror, (samples.observation, samples.action), strict=True)
+        )
+        # What the policy did before the update, not the image of what it did on the other side: where the two differ,
+        # the divergence would be large before the first step, and the adapted rate near zero.
+        mean, deviation = self.policy(state.actor, state.normalizer, observation)
+        return samples._replace(observation=observation, action=action, mean=mean, deviation=deviation)
+
     def _epochs(self, loss, params, optimizer_state, rate, flat, key, epochs: int, batch: int):
         """Minibatch descent of ``loss``; statistics are means over the last epoch, skips are counted over all."""
         count = len(flat[1])
@@ -326,15 +338,3 @@ def _floor_deviation(actor, least: float):
     parameters = actor["params"]
     floored = jax.tree.map(lambda value: jnp.maximum(value, jnp.log(least)), parameters[_DEVIATION])
     return {**actor, "params": {**parameters, _DEVIATION: floored}}
-
-
-def _mirrored(samples: Batch, mirror: Mirror, key: jax.Array) -> Batch:
-    """Samples ``[n, ...]``, each with probability 1/2 as its mirror image; returns and advantages are the same."""
-    chosen = jax.random.bernoulli(key, shape=samples.reward.shape)[..., None]
-    pick = lambda image, x: jnp.where(chosen, image(x), x)  # noqa: E731
-    return samples._replace(
-        observation=pick(mirror.observation, samples.observation),
-        action=pick(mirror.action, samples.action),
-        mean=pick(mirror.action, samples.mean),
-        deviation=pick(mirror.spread, samples.deviation),
-    )
