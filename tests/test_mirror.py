@@ -65,18 +65,21 @@ def test_an_update_teaches_both_sides_what_was_seen_on_one():
     opposite = mirror.Reflection(np.array([0]), np.array([-1.0]), np.zeros(1))
     noise = jax.random.normal(jax.random.PRNGKey(1), (8, 64, 1))
 
-    def moved(image):
-        ppo = PPO(2, 1, config, mirror=image)
+    def moved(image, **changes):
+        ppo = PPO(2, 1, dataclasses.replace(config, **changes), mirror=image)
         state = ppo.init(jax.random.PRNGKey(0))
         seen = jnp.broadcast_to(jnp.array([1.0, 0.0]), (8, 64, 2))
         mean, deviation = ppo.policy(state.actor, state.normalizer, seen)
         never = jnp.zeros((8, 64), bool)
         batch = Batch(seen, seen, mean + deviation * noise, mean, deviation, noise[..., 0], never, never)
-        after, _ = jax.jit(ppo.update)(state, batch, jax.random.PRNGKey(2))
+        after, figures = jax.jit(ppo.update)(state, batch, jax.random.PRNGKey(2))
         before, now = (ppo.policy(actor, state.normalizer, jnp.eye(2))[0] for actor in (state.actor, after.actor))
-        return np.asarray(now - before)[:, 0]
+        return np.asarray(now - before)[:, 0], float(figures["kl"])
 
-    alone, shared = moved(None), moved(mirror.Mirror(swapped, opposite))
+    both = mirror.Mirror(swapped, opposite)
+    (alone, _), (shared, _) = moved(None), moved(both)
     assert alone[0] > 0.01 and shared[0] > 0.01
     assert shared[1] < -0.5 * shared[0]
     assert alone[1] > -0.5 * alone[0]
+    # How far the policy is from symmetric is no divergence of the update.
+    assert moved(both, learning_rate=1e-9)[1] < 1e-6
