@@ -82,4 +82,4 @@ def test_an_update_teaches_both_sides_what_was_seen_on_one():
     assert shared[1] < -0.5 * shared[0]
     assert alone[1] > -0.5 * alone[0]
     # How far the policy is from symmetric is no divergence of the update.
-    assert moved(both, learning_rate=1e-9)[1] < 1e-6
+    assert moved(both, learning_rate=1e-9, mean_init=0.3)[1] < 1e-3
