@@ -134,6 +134,9 @@ def _draw(panel, name: str, across: np.ndarray, values: np.ndarray) -> None:
     panel.grid(alpha=0.25, linewidth=0.5)
     panel.spines[["top", "right"]].set_visible(False)
     panel.margins(x=0.02)
+    size = np.abs(y).max(initial=0.0)
+    if len(y) and np.ptp(y) < 1e-6 * size:  # a constant: its rounding would fill the panel
+        panel.set_ylim(y[0] - 0.1 * size, y[0] + 0.1 * size)
 
 
 def _running_mean(y: np.ndarray, half: int) -> np.ndarray:
