@@ -272,7 +272,7 @@ def test_a_device_that_is_not_there(tmp_path):
 
 
 def test_figures_and_their_picture_are_written_side_by_side(tmp_path, capsys):
-    found, run = SimpleNamespace(to_json=lambda: "{}\n"), SimpleNamespace(folder=tmp_path)
+    found, run = SimpleNamespace(to_json=lambda: "{}"), SimpleNamespace(folder=tmp_path)
 
     def draw(path, *drawn):
         path.write_text(f"{drawn}")
