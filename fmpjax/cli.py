@@ -58,6 +58,7 @@ class Evaluate:
         from fmpjax import following, steering
         from fmpjax.viz import along, heat
 
+        trainer.config.command.require("velocity", "phase")
         if sentence := steering.beyond(trainer):
             print(f"note: {sentence}")
         print("compiling the episodes ...", flush=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import fmpjax
 from fmpjax import transport
 from tests.helpers import ROOT
 
@@ -38,6 +39,10 @@ def test_every_requirement_is_imported_and_pinned():
         assert imported, name
         assert name in pinned, name
     assert {_name(requirement) for extra in ("dev", "docs") for requirement in optional[extra]} <= pinned
+
+
+def test_a_citation_names_the_version():
+    assert re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)[1] == fmpjax.__version__
 
 
 def test_the_oldest_versions_are_those_that_the_project_declares():

@@ -126,10 +126,10 @@ class CommandConfig(Section):
         given = (self.ahead, self.sideways, self.turn)
         return tuple(ends or (0.0, 0.0) for ends in given) if any(given) else None
 
-    def require(self, kind: str) -> None:
-        """Raise a `UserError` where a run's command is of another kind."""
-        if self.kind != kind:
-            raise UserError(f"the run's command.kind is {self.kind!r}: expected {kind!r}")
+    def require(self, *kinds: str) -> None:
+        """Raise a `UserError` where a run's command is of none of the kinds."""
+        if self.kind not in kinds:
+            raise UserError(f"the run's command.kind is {self.kind!r}: expected {' or '.join(map(repr, kinds))}")
 
     def check(self) -> None:
         """Raise a `UserError` where a range is none."""
