@@ -68,7 +68,7 @@ def make(robot: Robot, form: str, actions: ActionMap) -> Mirror:
     order, signs, start = [], [], 0
     for name, width in observation_terms(robot, form).items():
         if name not in parts:
-            raise UserError(f"setting ppo.mirror is True: the mirror image of the observation's {name} is not known")
+            raise UserError(f"setting ppo.mirror is not 0: the mirror image of the observation's {name} is not known")
         order.append(start + parts[name][0])
         signs.append(parts[name][1])
         start += width

@@ -88,7 +88,7 @@ class PPO:
       config: of the networks and their updates.
       clock: steps of the longest episode, where the critic also observes the share of them that is over. A reward that
         depends on an episode's past needs it. 0 for a critic that observes what the policy does.
-      mirror: of observations and actions; with it an update sees half of the samples as their mirror images.
+      mirror: of observations and actions, where the loss asks for a policy that does the same on both sides.
     """
 
     def __init__(
@@ -100,7 +100,9 @@ class PPO:
         mirror: Mirror | None = None,
     ):
         if mirror is not None and isinstance(observation_size, Seen):
-            raise UserError("setting ppo.mirror is True: expected False where the critic sees more than the policy")
+            raise UserError(
+                f"setting ppo.mirror is {config.mirror:g}: expected 0 where the critic sees more than the policy"
+            )
         self.config, self.clock, self.mirror = config, clock, mirror
         self.observation_size, self.action_size = observation_size, action_size
         activation, initializers = learning.activation(config.activation), jax.nn.initializers
@@ -194,8 +196,6 @@ class PPO:
         gain = jnp.clip((advantage - advantage.mean()) / spread, -config.advantage_clip, config.advantage_clip)
         return_variance = returns.var()
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), sharding.gather((batch, returns, gain)))
-        if self.mirror is not None:
-            flat = (self._mirrored(flat[0], self.mirror, state, jax.random.fold_in(key, 0)), *flat[1:])
         critic_key, actor_key = jax.random.split(key)
 
         def critic_loss(params, sample):
@@ -228,7 +228,12 @@ class PPO:
                 "clipped": jnp.mean((jnp.abs(ratio - 1.0) > config.clip).astype(ratio.dtype)),
                 "bound_penalty": bound,
             }
-            return surrogate + config.bound_penalty * bound, stats
+            loss = surrogate + config.bound_penalty * bound
+            if self.mirror is not None:
+                other, _ = self.policy(params, state.normalizer, self.mirror.observation(samples.observation))
+                off = jnp.mean(jnp.sum((other - self.mirror.action(mean)) ** 2, axis=-1))
+                loss, stats = loss + config.mirror * off, stats | {"asymmetry": off}
+            return loss, stats
 
         actor, actor_optimizer, actor_stats = self._epochs(
             actor_loss, state.actor, state.actor_optimizer, state.rate, flat, actor_key,
@@ -260,19 +265,9 @@ class PPO:
             "advantage_deviation": spread,
             "explained_variance": 1.0 - jnp.mean((returns - value) ** 2) / jnp.maximum(return_variance, 1e-8),
         }
+        if self.mirror is not None:
+            metrics["asymmetry"] = actor_stats["asymmetry"]
         return new_state, metrics
-
-    def _mirrored(self, samples: Batch, mirror: Mirror, state: PPOState, key: jax.Array) -> Batch:
-        """Samples ``[n, ...]``, each with probability 1/2 as its mirror image; returns and advantages are the same."""
-        chosen = jax.random.bernoulli(key, shape=samples.reward.shape)[..., None]
-        observation, action = (
-            jnp.where(chosen, image(x), x)
-            for image, x in zip(mirror, (samples.observation, samples.action), strict=True)
-        )
-        # What the policy did before the update, not the image of what it did on the other side: where the two differ,
-        # the divergence would be large before the first step, and the adapted rate near zero.
-        mean, deviation = self.policy(state.actor, state.normalizer, observation)
-        return samples._replace(observation=observation, action=action, mean=mean, deviation=deviation)
 
     def _epochs(self, loss, params, optimizer_state, rate, flat, key, epochs: int, batch: int):
         """Minibatch descent of ``loss``; statistics are means over the last epoch, skips are counted over all."""

@@ -229,7 +229,8 @@ class PPOConfig(Section):
     normalizer_from_clip: bool = False  # start the running statistics of observations from the demonstration [M: no]
     # limit on the count of these statistics, which then forget slowly; 0: none [M: 0]
     normalizer_count: NonNegativeInt = 0
-    mirror: bool = False  # updates see half of the samples as their mirror images, left for right [D]
+    # weight of the squared difference between the mean action in a mirrored state and the mirrored mean action [D]
+    mirror: NonNegativeFloat = 0.0
 
     def check(self) -> None:
         """Raise a `UserError` where minibatches would not be equal."""
