@@ -9,7 +9,7 @@ import numpy as np
 from fmpjax.actions import ActionMap
 from fmpjax.errors import UserError
 from fmpjax.features import observation_terms
-from fmpjax.motion.edit import SIDES, joint_mirror
+from fmpjax.motion.edit import joint_mirror, partner
 from fmpjax.robots import Robot
 
 # Reflection in y = 0. Vectors such as velocities change their y; turns, which are axial vectors, change their x and z.
@@ -43,7 +43,7 @@ def make(robot: Robot, form: str, actions: ActionMap) -> Mirror:
     """
     joints, sign = joint_mirror(robot)
     names = [robot.model.body(int(body) + 1).name for body in robot.key_body]
-    points = [names.index(_partner(name)) for name in names]
+    points = [names.index(partner(name)) for name in names]
     rows, cut = np.arange(robot.joint_count + (robot.jointless_row is not None)), robot.jointless_row
     if cut is None:
         rotations = joints
@@ -78,11 +78,6 @@ def make(robot: Robot, form: str, actions: ActionMap) -> Mirror:
         Reflection(np.concatenate(order), np.concatenate(signs).astype(float), np.zeros(start)),
         Reflection(joints, sign * actions.scale[joints] / actions.scale, shift),
     )
-
-
-def _partner(name: str) -> str:
-    side = next((side for side in SIDES if name.startswith(side)), "")
-    return SIDES.get(side, "") + name.removeprefix(side)
 
 
 def _blocks(order: np.ndarray, sign: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -36,16 +36,20 @@ def joint_mirror(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     index = {name: i for i, name in enumerate(robot.joint_names)}
     order = np.zeros(robot.joint_count, int)
     for name, i in index.items():
-        side = next((s for s in SIDES if name.startswith(s)), "")
-        partner = SIDES.get(side, "") + name.removeprefix(side)
-        if partner not in index:
-            raise UserError(f"robot {robot.name!r} has no joint {partner!r}, the mirror image of {name!r}")
-        order[i] = index[partner]
+        if partner(name) not in index:
+            raise UserError(f"robot {robot.name!r} has no joint {partner(name)!r}, the mirror image of {name!r}")
+        order[i] = index[partner(name)]
     sign = np.sum(robot.joint_axis[order] * robot.joint_axis * [-1, 1, -1], axis=1)
     odd = np.flatnonzero(np.abs(np.abs(sign) - 1) > 1e-6)
     if len(odd):
         raise UserError(f"robot {robot.name!r} is not symmetric at joint {robot.joint_names[odd[0]]!r}")
     return order, np.round(sign)
+
+
+def partner(name: str) -> str:
+    """The name of the joint or body on the other side; of one in the middle its own."""
+    side = next((side for side in SIDES if name.startswith(side)), "")
+    return SIDES.get(side, "") + name.removeprefix(side)
 
 
 def headed(clip: MotionClip, heading: float) -> MotionClip:
