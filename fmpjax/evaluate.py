@@ -248,7 +248,7 @@ class Evaluator:
         length = played.length[detail]
         speed = metrics.late_speed(root[:, detail], length, heading[detail], rate=rate)
         yaw = rotations.yaw(played.qpos[:, detail, 3:7].astype(np.float64))
-        path_speed, turn = metrics.late_course(root[:, detail], yaw, length, rate=rate)
+        path_speed, turn = metrics.late_path(root[:, detail], yaw, length, rate=rate)
         joints = played.qpos[:, detail, 7:].astype(np.float64)
         ranges = metrics.window_ranges(joints, length, robot.sagittal_joints, rate=rate)
         expert = library.mean(

@@ -118,15 +118,15 @@ def figures(played: Played, begun: np.ndarray, joints: np.ndarray, rate: float, 
     return Following(
         episodes=len(finished),
         finished=int(finished.sum()),
-        joint_error=_mean(off[counts]),
-        key_point_error=_mean(np.linalg.norm(played.points - played.wanted_points, axis=-1).mean(-1)[counts]),
-        height_error=_mean(np.abs(root[..., 2])[counts]),
-        root_error=_mean(np.linalg.norm(root, axis=-1)[counts]),
+        joint_error=metrics.mean(off[counts]),
+        key_point_error=metrics.mean(np.linalg.norm(played.points - played.wanted_points, axis=-1).mean(-1)[counts]),
+        height_error=metrics.mean(np.abs(root[..., 2])[counts]),
+        root_error=metrics.mean(np.linalg.norm(root, axis=-1)[counts]),
         excursion=_excursion(played, length * finished, joints, rate),
         seconds=seconds,
-        part_joint_error=tuple(_mean(off[counts & (part == i)]) for i in range(PARTS)),
+        part_joint_error=tuple(metrics.mean(off[counts & (part == i)]) for i in range(PARTS)),
         part_falls=tuple(int((played.fell & (ended == i)).sum()) for i in range(PARTS)),
-        part_finished=tuple(_mean(finished[own == i]) for i in range(PARTS)),
+        part_finished=tuple(metrics.mean(finished[own == i]) for i in range(PARTS)),
     )
 
 
@@ -137,10 +137,6 @@ def _excursion(played: Played, length: np.ndarray, joints: np.ndarray, rate: flo
     )
     known = np.isfinite(policy)
     return float(policy[known].sum() / clip[known].sum()) if known.any() and clip[known].sum() > 0 else float("nan")
-
-
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean()) if values.size else float("nan")
 
 
 def table(following: Following) -> str:

@@ -9,6 +9,7 @@ episode; later rows are never read. The metrics return one value per episode, Na
 import dataclasses
 
 import numpy as np
+import numpy.typing as npt
 
 from fmpjax.config import Config
 from fmpjax.errors import UserError
@@ -32,8 +33,12 @@ class Summary:
 
 def summarize(per_episode: np.ndarray) -> Summary:
     """Mean and number of the finite values of ``per_episode [N]``."""
-    finite = np.isfinite(per_episode)
-    return Summary(float(_mean(np.asarray(per_episode, np.float64), axis=0)), int(finite.sum()))
+    return Summary(mean(per_episode), int(np.isfinite(per_episode).sum()))
+
+
+def mean(values: npt.ArrayLike) -> float:
+    """Mean of the finite values of an array of any shape, in float64; NaN where there are none."""
+    return float(_mean(np.asarray(values, np.float64).ravel(), axis=0))
 
 
 def late_speed(
@@ -67,7 +72,7 @@ def late_speed(
     return _forward(moved, heading) / seconds
 
 
-def late_course(
+def late_path(
     root_position: np.ndarray,
     yaw: np.ndarray,
     length: np.ndarray,

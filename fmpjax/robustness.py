@@ -161,13 +161,13 @@ class Player:
         disturbed = disturbed._replace(share=jnp.ones_like(disturbed.share))
         alive = jnp.ones(self.count, bool)
         under_way = _Second(self._start._replace(disturbed=disturbed), alive, ~alive, jnp.zeros(self.count, jnp.int32))
-        steps, courses = self.env.config.episode_steps, []
+        steps, recorded = self.env.config.episode_steps, []
         for i in range(-(-steps // self.chunk)):
             under_way, qpos = self._second(state, under_way, jax.random.fold_in(self._key, 100 + i))
-            courses.append(np.asarray(qpos))
+            recorded.append(np.asarray(qpos))
             if not np.asarray(under_way.alive).any():
                 break
-        qpos = np.concatenate(courses)[:steps]
+        qpos = np.concatenate(recorded)[:steps]
         # An episode of the longest length may have ended within the last chunk, past its end.
         length = np.minimum(np.asarray(under_way.length), steps)
         fell = np.asarray(under_way.fell) & (np.asarray(under_way.length) <= steps)
@@ -209,7 +209,7 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = EPISODES, note
 def _cell(trainer: Trainer, case: Case, qpos: np.ndarray, length: np.ndarray, fell: np.ndarray) -> Cell:
     rate, robot = trainer.config.control_rate, trainer.robot
     low, high = wilson(int(fell.sum()), len(fell))
-    speeds, _ = metrics.late_course(qpos[..., :3], rotations.yaw(qpos[..., 3:7].astype(np.float64)), length, rate=rate)
+    speeds, _ = metrics.late_path(qpos[..., :3], rotations.yaw(qpos[..., 3:7].astype(np.float64)), length, rate=rate)
     expert = trainer.library.mean(
         [metrics.expert_ranges(clip.qpos[:, 7:], robot.sagittal_joints, rate=rate) for clip in trainer.library.clips]
     )

@@ -2,13 +2,13 @@
 
 import dataclasses
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import frozen, jsons, tables
+from fmpjax import frozen, jsons, metrics, tables
 from fmpjax.commands import velocity
 from fmpjax.frames import FrameLayout
 from fmpjax.ppo import PPOState
@@ -102,18 +102,18 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 256, each: int
     off = np.abs(means - legs)[moved.alive.reshape(LEGS, length, episodes)[:, -1]]
     return Steering(
         cells=tuple(cells),
-        speed_error=_mean([cell.speed_error for cell in plane]),
-        turn_error=_mean([cell.turn_error for cell in plane]),
+        speed_error=metrics.mean([cell.speed_error for cell in plane]),
+        turn_error=metrics.mean([cell.turn_error for cell in plane]),
         episodes=told.shape[1],
         falls=int(played.fell.sum()),
-        sideways_error=_mean([cell.drift for cell in aside]),
-        straight_turn=_mean([abs(cell.turned) for cell in straight]),
-        standing_speed=_mean(way[still].ravel()),
+        sideways_error=metrics.mean([cell.drift for cell in aside]),
+        straight_turn=metrics.mean([abs(cell.turned) for cell in straight]),
+        standing_speed=metrics.mean(way[still].ravel()),
         changing_episodes=episodes,
         changing_falls=int(moved.fell.sum()),
-        changing_speed_error=_mean(off[:, 0]),
-        changing_turn_error=_mean(off[:, 2]),
-        changing_sideways_error=_mean(off[:, 1]),
+        changing_speed_error=metrics.mean(off[:, 0]),
+        changing_turn_error=metrics.mean(off[:, 2]),
+        changing_sideways_error=metrics.mean(off[:, 1]),
     )
 
 
@@ -187,21 +187,15 @@ def _cells(grid: np.ndarray, reached: np.ndarray, fell: np.ndarray) -> list[Cell
                 turn=float(command[2]),
                 episodes=len(falls),
                 falls=int(falls.sum()),
-                speed=_mean(means[:, 0]),
-                turned=_mean(means[:, 2]),
-                speed_error=_mean(off[:, 0]),
-                turn_error=_mean(off[:, 2]),
-                drift=_mean(off[:, 1]),
+                speed=metrics.mean(means[:, 0]),
+                turned=metrics.mean(means[:, 2]),
+                speed_error=metrics.mean(off[:, 0]),
+                turn_error=metrics.mean(off[:, 2]),
+                drift=metrics.mean(off[:, 1]),
                 sideways=float(command[1]),
             )
         )
     return cells
-
-
-def _mean(values: Any) -> float:
-    """Mean of what is not NaN; NaN where nothing is left."""
-    values = np.asarray(values, float)
-    return float(values[~np.isnan(values)].mean()) if (~np.isnan(values)).any() else float("nan")
 
 
 def table(steering: Steering) -> str:

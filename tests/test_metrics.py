@@ -56,7 +56,7 @@ def test_late_speed_of_a_short_record_is_excluded():
     assert np.isnan(metrics.late_speed(np.zeros((100, 2, 3)), np.array([100, 1]), np.zeros(2))).all()
 
 
-def test_late_course_follows_the_robots_own_heading():
+def test_late_path_follows_the_robots_own_heading():
     """Circles: the chord of an arc of angle a is 2 r sin(a / 2), and the heading in its middle is the chord's."""
     steps = np.arange(500)
     # Left at 1 rad/s with radius 0.5 m, right at 2 rad/s with 1 m and walking backward, straight along -x at 0.3 m/s.
@@ -69,16 +69,16 @@ def test_late_course_follows_the_robots_own_heading():
     position[:, 2, 0] = -0.3 * steps / 50
     yaw = np.concatenate([yaw, np.full((500, 1), np.pi)], axis=1)
     yaw = (yaw + np.pi) % (2 * np.pi) - np.pi  # as a quaternion gives it
-    speed, turn = metrics.late_course(position, yaw, np.full(3, 500))
+    speed, turn = metrics.late_path(position, yaw, np.full(3, 500))
     chord = 2 * radius * np.sin(np.abs(rate) / 100) * 50
     np.testing.assert_allclose(speed, [chord[0], -chord[1], 0.3], rtol=1e-9)
     np.testing.assert_allclose(turn, [1.0, -2.0, 0.0], atol=1e-9)
 
 
-def test_late_course_reads_what_late_speed_reads():
+def test_late_path_reads_what_late_speed_reads():
     rng = np.random.default_rng(0)
     position, length = rng.normal(size=(600, 5, 3)).cumsum(0), np.array([200, 250, 251, 400, 600])
-    speed, turn = metrics.late_course(position, np.full((600, 5), 0.7), length)
+    speed, turn = metrics.late_path(position, np.full((600, 5), 0.7), length)
     np.testing.assert_allclose(speed, metrics.late_speed(position, length, np.full(5, 0.7)), rtol=1e-9)
     np.testing.assert_array_equal(np.isnan(turn), [True, True, False, False, False])
 

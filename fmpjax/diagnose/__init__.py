@@ -1,21 +1,21 @@
 """What is wrong with a run, in words: one sentence per symptom, with the figure, its healthy range and where to look.
 
 `RULES` is the one place that has the healthy ranges; the table in ``docs/metrics.md`` is `page()`. A rule reads a
-`Course`: the rows of ``metrics.csv``, the configuration and one evaluation. Among the courses of the preset ``laptop``
+`History`: the rows of ``metrics.csv``, the configuration and one evaluation. Among the runs of the preset ``laptop``
 below ``experiments/results``, the bounds separate those that walk from those that do not; `Rule.evidence` names them.
-Where no course shows the fault, the bound lies beyond all that the courses reach, and the evidence says so.
+Where no run shows the fault, the bound lies beyond all that the runs reach, and the evidence says so.
 
-Rules whose figure is missing in a course are not checked, and the report names them.
+Rules whose figure is missing in a history are not checked, and the report names them.
 """
 
-from fmpjax.diagnose.course import Course, Missing, newest, read
+from fmpjax.diagnose.history import History, Missing, newest, read
 from fmpjax.diagnose.rules import RULES, Range, Rule
 from fmpjax.diagnose.sentences import SETTLED, page, report, symptoms, text
 
 __all__ = [
     "RULES",
     "SETTLED",
-    "Course",
+    "History",
     "Missing",
     "Range",
     "Rule",

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from fmpjax import config as configuration
 from fmpjax.diagnose import measures
-from fmpjax.diagnose.course import Course
+from fmpjax.diagnose.history import History
 from fmpjax.diagnose.measures import DISTINCT, STEADIEST, STEPS, TRAVELS
 
 _POTENTIALS = ("fmp", "endpoint", "value")
@@ -43,13 +43,13 @@ class Range:
 
 
 class _Figures(dict):
-    """The figures that a sentence may name: those of the course, and ``speed``."""
+    """The figures that a sentence may name: those of the history, and ``speed``."""
 
-    def __init__(self, course: Course):
-        self._course = course
+    def __init__(self, history: History):
+        self._history = history
 
     def __missing__(self, name: str) -> float:
-        return measures.speed(self._course) if name == "speed" else self._course[name]
+        return measures.speed(self._history) if name == "speed" else self._history[name]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,32 +57,32 @@ class Rule:
     """A symptom: a figure that leaves its healthy range."""
 
     name: str
-    says: str  # how the sentence begins; figures of the course, or `speed`, in braces
+    says: str  # how the sentence begins; figures of the history, or `speed`, in braces
     figure: str  # what is measured
-    measure: Callable[[Course], float | None]  # None where the rule does not apply
+    measure: Callable[[History], float | None]  # None where the rule does not apply
     healthy: Range
     look: tuple[str, ...]  # settings
-    evidence: str  # what the committed courses show
+    evidence: str  # what the committed runs show
     when: str = ""  # the rule applies, for the page
     methods: tuple[str, ...] = ()  # that have the figure; empty for all
 
-    def sentence(self, course: Course) -> str | None:
+    def sentence(self, history: History) -> str | None:
         """What is wrong; None where the figure is healthy or the rule does not apply.
 
         Raises:
-          Missing: the course does not have a figure.
+          Missing: the history does not have a figure.
         """
-        if self.methods and course.config.method not in self.methods:
+        if self.methods and history.config.method not in self.methods:
             return None
-        value = self.measure(course)
+        value = self.measure(history)
         if value is None or value in self.healthy:
             return None
-        settings = configuration.flatten(course.config)
+        settings = configuration.flatten(history.config)
         # A switch that is off already is no advice.
-        mine = [key for key in self.look if reads(course.config.method, key) and settings[key] is not False]
+        mine = [key for key in self.look if reads(history.config.method, key) and settings[key] is not False]
         look = [f"{key} (now {settings[key]})" for key in mine]
         where = " and ".join([", ".join(look[:-1]), look[-1]] if look[1:] else look)
-        says = self.says.format_map(_Figures(course))
+        says = self.says.format_map(_Figures(history))
         return f"{says}: {self.figure} is {value:.3g}, healthy is {self.healthy}; look at {where}."
 
 
@@ -107,7 +107,7 @@ RULES = (
         "falls early",
         "It falls within the steps that training episodes have, in {eval/falls:.0f} of {eval/episodes:.0f} episodes",
         "share of evaluation episodes that fall",
-        lambda course: measures.falls(course, late=False),
+        lambda history: measures.falls(history, late=False),
         Range(high=0.1),
         ("env.reset_noise", "ppo.gae_lambda", "transitions"),
         "walks end at 0.06 or less; `lafan1_standing` 0.29, `table1/value-fixed-seed0` 1",
@@ -117,7 +117,7 @@ RULES = (
         "falls late",
         "It falls later than training episodes last, in {eval/falls:.0f} of {eval/episodes:.0f} episodes",
         "share of evaluation episodes that fall",
-        lambda course: measures.falls(course, late=True),
+        lambda history: measures.falls(history, late=True),
         Range(high=0.1),
         ("env.last_cap", "evaluations"),
         "walks end at 0.06 or less; `learning_apart/late-128-seed0` 0.37, `mirrored-seed0` 0.48",
@@ -127,7 +127,7 @@ RULES = (
         "falls in training",
         "It falls in training, where episodes last {train/episode_length:.0f} of {env/cap:.0f} steps",
         "share of training episodes that fall",
-        lambda course: course["train/falls"],
+        lambda history: history["train/falls"],
         Range(high=0.2),
         ("ppo.gae_lambda", "env.first_cap", "transitions"),
         "walks end at 0.18 or less; `learning_apart/rollout-128-seed0` 0.34, "
@@ -137,7 +137,7 @@ RULES = (
         "stands",
         "It stands, at {speed:.2f} m/s where the demonstration goes at {eval/demonstration_speed:.2f}",
         "excursion",
-        lambda course: measures.excursion(course, travels=False),
+        lambda history: measures.excursion(history, travels=False),
         Range(low=STEPS),
         ("prior.query_is_bank", "ppo.discount", "method"),
         "`lafan1_standing` 0.18, `table1/barycentric-*` 0.01, `table1_bank_queries/fmp-fixed-seed0` 0.36; none that "
@@ -159,10 +159,10 @@ RULES = (
         "shuffles",
         "It travels on steps that are too small",
         "excursion",
-        lambda course: measures.excursion(course, travels=True),
+        lambda history: measures.excursion(history, travels=True),
         Range(low=STEPS),
         ("features.deviation_floor", "features.angular_velocity_floor"),
-        "all that walk are at 0.69 or more; no course shuffles",
+        "all that walk are at 0.69 or more; no run shuffles",
         f"the late speed is at least {TRAVELS:g} of the demonstration's",
     ),
     Rule(
@@ -172,7 +172,7 @@ RULES = (
         measures.stamping,
         Range(high=1.5),
         ("env.action", "ppo.bound_penalty"),
-        "the highest is 1.40, `lafan1_walk_seed1` on the way; no course stamps",
+        "the highest is 1.40, `lafan1_walk_seed1` on the way; no run stamps",
     ),
     Rule(
         "too slow",
@@ -213,7 +213,7 @@ RULES = (
         measures.limp,
         Range(high=0.4),
         ("motion", "transitions"),
-        "the highest is 0.33, `table1/value-dataset-seed0` on the way; no course that stays up limps",
+        "the highest is 0.33, `table1/value-dataset-seed0` on the way; no run that stays up limps",
         f"the excursion is at least {STEPS:g}",
     ),
     Rule(
@@ -229,37 +229,37 @@ RULES = (
         "reward flat",
         "The reward is flat: scores tie, or differ by less than the floor",
         "`train/reward_spread`",
-        lambda course: course["train/reward_spread"],
+        lambda history: history["train/reward_spread"],
         Range(low=0.45),
         ("prior.spread_floor",),
-        "0.486 to 0.490 in every course, standing ones too; no row under 0.472",
+        "0.486 to 0.490 in every run, standing ones too; no row under 0.472",
         methods=_CENTERED,
     ),
     Rule(
         "reward flat, not centered",
         "The reward is flat: whatever the policy does earns about the same",
         "`train/reward_spread`",
-        lambda course: course["train/reward_spread"],
+        lambda history: history["train/reward_spread"],
         Range(low=0.08),
         ("prior.temperature", "amp.gradient_penalty", "wail.gradient_penalty", "method"),
-        "`table1/barycentric-fixed-seed0`, which stands, 0.04; AMP walks at 0.20; no course is of WAIL",
+        "`table1/barycentric-fixed-seed0`, which stands, 0.04; AMP walks at 0.20; no run is of WAIL",
         methods=("amp", "barycentric", "wail"),
     ),
     Rule(
         "reward flat, in its logarithm",
         "The reward is flat: whatever the policy does earns about the same share of the most that it can",
         "`fit/score_spread`",
-        lambda course: course["fit/score_spread"],
+        lambda history: history["fit/score_spread"],
         Range(low=0.1),
         ("pwil.decay", "smp.decay", "smp.iterations", "method"),
-        "half of the rewards are within a tenth of each other; no course is of these methods",
+        "half of the rewards are within a tenth of each other; no run is of these methods",
         methods=("pwil", "smp"),
     ),
     Rule(
         "scores tie",
         "The policy's windows score alike, so that the reward magnifies noise",
         "`fit/score_spread` over `prior.spread_floor`",
-        lambda course: course["fit/score_spread"] / course.config.prior.spread_floor,
+        lambda history: history["fit/score_spread"] / history.config.prior.spread_floor,
         Range(low=3.0),
         ("prior.spread_floor", "ppo.deviation"),
         "`table1_bank_queries/value-fixed-seed0`, which stands, 2.1; the bundled walks 12, no row of theirs under 5",
@@ -269,7 +269,7 @@ RULES = (
         "margin negative",
         "The reward does not rank the demonstration above the policy",
         "`fit/expert_margin`",
-        lambda course: course["fit/expert_margin"],
+        lambda history: history["fit/expert_margin"],
         Range(low=0.1),
         (
             *("prior.endpoint_weight", "prior.flow_weight", "amp.gradient_penalty", "gail.gradient_penalty"),
@@ -284,7 +284,7 @@ RULES = (
         "The discriminator is sure of every window (it tells {fit/agent_accuracy:.2f} of the policy's), and its reward "
         "is near 0",
         "`fit/discriminator_loss`",
-        lambda course: course["fit/discriminator_loss"],
+        lambda history: history["fit/discriminator_loss"],
         Range(low=0.05),
         (
             *("amp.gradient_penalty", "amp.learning_rate", "amp.updates"),
@@ -292,24 +292,24 @@ RULES = (
             *("add.gradient_penalty", "add.learning_rate", "add.updates"),
         ),
         "AMP is at 0.24 to 0.41 at the ends, no row under 0.11; an accuracy of 1 alone is no fault: "
-        "`table1/amp-fixed-seed0` walks with it; no course is of GAIL or ADD",
+        "`table1/amp-fixed-seed0` walks with it; no run is of GAIL or ADD",
         methods=("amp", "gail", "add"),
     ),
     Rule(
         "fit unconverged",
         "The transport does not converge",
         "`fit/unconverged`, solves per rollout",
-        lambda course: course["fit/unconverged"],
+        lambda history: history["fit/unconverged"],
         Range(high=0.1),
         ("prior.sinkhorn_iterations", "prior.epsilon_fraction"),
-        "0 in every row of every course",
+        "0 in every row of every run",
         methods=_TRANSPORTS,
     ),
     Rule(
         "iterations at their maximum",
         "The transport's solves take nearly all the iterations that they may",
         "`fit/sinkhorn_iterations` over `prior.sinkhorn_iterations`",
-        lambda course: course["fit/sinkhorn_iterations"] / max(course.config.prior.sinkhorn_iterations, 1),
+        lambda history: history["fit/sinkhorn_iterations"] / max(history.config.prior.sinkhorn_iterations, 1),
         Range(high=0.9),
         ("prior.sinkhorn_iterations", "prior.epsilon_fraction"),
         "0.29 at most, the bundled walks",
@@ -333,26 +333,26 @@ RULES = (
         measures.nonfinite,
         Range(high=0.0),
         ("physics.timestep", "nonfinite_limit"),
-        "0 in every row of every course",
+        "0 in every row of every run",
     ),
     Rule(
         "reward updates skipped",
         "Updates of the reward are left out",
         "`fit/skipped`, per rollout",
-        lambda course: course["fit/skipped"],
+        lambda history: history["fit/skipped"],
         Range(high=0.0),
         tuple(f"{section}.learning_rate" for section in ("prior", "amp", "gail", "wail", "smp", "add")),
-        "0 in every row of every course",
+        "0 in every row of every run",
         methods=(*_POTENTIALS, "amp", "gail", "wail", "smp", "add"),
     ),
     Rule(
         "policy updates skipped",
         "Updates of the policy or its critic are left out",
         "`ppo/skipped`, per rollout",
-        lambda course: course["ppo/skipped"],
+        lambda history: history["ppo/skipped"],
         Range(high=0.0),
         ("ppo.learning_rate", "ppo.clip_norm"),
-        "0 in every row of every course",
+        "0 in every row of every run",
     ),
     Rule(
         "KL off its target",
@@ -361,13 +361,13 @@ RULES = (
         measures.kl,
         Range(0.5, 2.0),
         ("ppo.target_kl", "ppo.learning_rate"),
-        "0.73 to 1.40 at the ends, no row above 1.9 after 0.15 M transitions; no course without a target",
+        "0.73 to 1.40 at the ends, no row above 1.9 after 0.15 M transitions; no run without a target",
     ),
     Rule(
         "clipped share high",
         "Most samples leave PPO's bound",
         "`ppo/clipped`",
-        lambda course: course["ppo/clipped"],
+        lambda history: history["ppo/clipped"],
         Range(high=0.6),
         ("ppo.learning_rate", "ppo.actor_epochs", "ppo.clip"),
         "0.20 to 0.48 at the ends, no row above 0.57",
@@ -376,7 +376,7 @@ RULES = (
         "critic worse than a constant",
         "The critic predicts returns worse than their mean would",
         "`ppo/explained_variance`",
-        lambda course: course["ppo/explained_variance"],
+        lambda history: history["ppo/explained_variance"],
         Range(low=0.0),
         ("ppo.critic_epochs", "ppo.learning_rate"),
         "0.71 or more at the ends; under 0 in the first row of the fixed pose alone",

@@ -133,17 +133,17 @@ def plan(specification: Specification, motions: Sequence[str]) -> list[Cell]:
 
 def write(planned: Sequence[Cell], folder: Path) -> list[Path]:
     """Scores, statistics and pictures of the finished cells in ``folder``; the paths written."""
-    courses = [scores.read(cell, folder) for cell in planned if cells.finished(cell, folder)]
-    found = scores.results(courses)
+    histories = [scores.read(cell, folder) for cell in planned if cells.finished(cell, folder)]
+    found = scores.results(histories)
     record = {
         "plan": {
             "preset": planned[0].config.preset,
             "transitions": planned[0].config.transitions,
             **{key: _each(planned, key) for key in ("methods", "motions", "resets", "seeds")},
         },
-        "cells": {"planned": len(planned), "finished": len(courses)},
-        "machines": scores.machines(courses),
-        "runs": {course.cell.name: table.origin(folder / course.cell.name) for course in courses},
+        "cells": {"planned": len(planned), "finished": len(histories)},
+        "machines": scores.machines(histories),
+        "runs": {history.cell.name: table.origin(folder / history.cell.name) for history in histories},
         **comparison.compare(found),
     }
     record["notes"] = notes(record)

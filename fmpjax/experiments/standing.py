@@ -64,14 +64,15 @@ class Moments(NamedTuple):
 def gather(trainer: Trainer, state: TrainState, key: jax.Array) -> Moments:
     """Play the policy of ``state`` on, and score what it does with the prior of ``state``."""
     env, steps = trainer.env, trainer.config.ppo.rollout_steps
-    forward = FrameLayout.of(trainer.robot).velocity.start
-    lag = jnp.arange(1 - env.horizon, 1)[:, None] / trainer.config.control_rate  # s before the newest frame
+    layout = FrameLayout.of(trainer.robot)
+    forward, ahead = layout.velocity.start, layout.root.start
+    lag = jnp.arange(1 - env.horizon, 1) / trainer.config.control_rate  # s before the newest frame
 
     def play(env_state, key):
         after, record = env.rollout(env_state, trainer.ppo.act(state.ppo), key, steps)
         frames = env.frame_table(env_state, record)[record.window]
         # A faster window also comes from further back.
-        faster = frames.at[..., forward].add(PUSH).at[..., :1].add(PUSH * lag)
+        faster = frames.at[..., forward].add(PUSH).at[..., ahead].add(PUSH * lag)
         windows = trainer.feature_map(frames), trainer.feature_map(faster)
         return after._replace(cap=env_state.cap), (*windows, frames[..., forward].mean(-1), record)
 
@@ -380,14 +381,14 @@ def measure(
     print(f"wrote {figure(out / 'standing.png', (out,))}")
 
 
-def figure(out: Path, runs: tuple[Path, ...]) -> Path:
+def figure(out: Path, measured: tuple[Path, ...]) -> Path:
     """Draw the measurements of one or several folders.
 
     Args:
       out: PNG to write.
-      runs: folders that `measure` wrote.
+      measured: folders that `measure` wrote.
     """
-    return curves.comparison(out, {run.name: run / "standing.csv" for run in runs}, _PANELS)
+    return curves.comparison(out, {folder.name: folder / "standing.csv" for folder in measured}, _PANELS)
 
 
 COMMANDS = Group("Measure why a policy stands before it walks.", {"measure": measure, "look": look, "figure": figure})

@@ -1,6 +1,6 @@
 """What a method learns of the demonstrations before any policy: made once, and kept in the user's cache folder.
 
-A folder there is named after a hash of all that the result depends on. It holds ``learned.npz``, the course of the
+A folder there is named after a hash of all that the result depends on. It holds ``learned.npz``, the figures of the
 training (``metrics.csv``, ``tensorboard/``, ``curves.png``) and ``settings.json``, which says what it is.
 """
 
@@ -31,7 +31,7 @@ from fmpjax.viz import curves
 FORMAT = 1  # of what is kept, and of the features; another one makes all that was kept before unknown
 ROWS = 200  # of the table, at most
 SEED = 0  # of the training, which is the same for all runs
-COURSE = "pretraining"  # folder of a run that has the course
+FOLDER = "pretraining"  # of a run, with the loss curve
 _LEARNED = "learned.npz"
 
 
@@ -98,7 +98,7 @@ def pretrain(trainer: Trainer, folder: Path, progress: Progress, *, again: bool 
 def pretrained(
     trainer: Trainer, states: Sequence[TrainState], runs: Sequence[Path], progress: Progress
 ) -> list[TrainState]:
-    """The states with what their method learns before any policy; the runs' folders get its course.
+    """The states with what their method learns before any policy; the runs' folders get its loss curve.
 
     Of several processes the first one trains.
 
@@ -111,12 +111,12 @@ def pretrained(
     learned, refused = pretraining.learned(states[0].prior), None
     if sharding.primary():
         try:
-            folder = folder_of(trainer) or runs[0] / COURSE
+            folder = folder_of(trainer) or runs[0] / FOLDER
             learned = pretrain(trainer, folder, progress)
             ignored = shutil.ignore_patterns(_LEARNED)
-            for course in (run / COURSE for run in runs):
-                if course != folder:
-                    shutil.copytree(folder, course, ignore=ignored, dirs_exist_ok=True)
+            for copy in (run / FOLDER for run in runs):
+                if copy != folder:
+                    shutil.copytree(folder, copy, ignore=ignored, dirs_exist_ok=True)
         except UserError as error:
             refused = error
     if not sharding.agree(refused is None):
@@ -127,7 +127,7 @@ def pretrained(
 
 
 def _train(trainer: Trainer, folder: Path, progress: Progress) -> Any:
-    """Train, and write the result and the course into a folder."""
+    """Train, and write the result and its loss curve into a folder."""
     pretraining, method = trainer.prior.pretraining, trainer.config.method
     assert pretraining is not None
     count, began = pretraining.iterations, time.monotonic()

@@ -76,8 +76,8 @@ class Recorder:
             self.best = evaluation.score
         figures = {f"eval/{name}": float(value) for name, value in evaluation.as_dict().items()}
         self._write(at, {**row, **figures}, state, better=better)
-        course = diagnose.Course(self.log.rows, self._config, json.loads(evaluation.to_json()))
-        self._note(diagnose.text(course))
+        history = diagnose.History(self.log.rows, self._config, json.loads(evaluation.to_json()))
+        self._note(diagnose.text(history))
 
     def save(self, state: TrainState, *, best: bool = False) -> None:
         """Save a checkpoint."""

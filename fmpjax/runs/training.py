@@ -5,9 +5,7 @@ import signal
 import time
 from collections.abc import Generator, Sequence
 
-import numpy as np
-
-from fmpjax import evaluate, memory, sharding
+from fmpjax import evaluate, memory, metrics, sharding
 from fmpjax.errors import UserError, out_of_memory
 from fmpjax.logs import Progress, check_logger, clock
 from fmpjax.motion import library
@@ -150,7 +148,7 @@ def _recorders(session: Session, progress: Progress, logger: str | None) -> list
 def progress_line(training: Clock, rows: Sequence[dict[str, float]]) -> str:
     """Where a training stands, in one line: the runs' mean metrics, their speed together and the time left."""
     config = training.config
-    m = {name: _mean([row[name] for row in rows]) for name in rows[0]}
+    m = {name: metrics.mean([row[name] for row in rows]) for name in rows[0]}
     losses = " ".join(
         f"{name} {m[f'fit/{name}_loss']:.2f}" for name in ("value", "endpoint", "flow") if f"fit/{name}_loss" in m
     )
@@ -160,12 +158,6 @@ def progress_line(training: Clock, rows: Sequence[dict[str, float]]) -> str:
         f"episode {m['train/episode_length']:.0f} of {m['env/cap']:.0f} steps, falls {100 * m['train/falls']:.0f} % | "
         f"speed {m['train/speed']:+.2f} m/s | reward spread {m['train/reward_spread']:.2f} | {losses}"
     )
-
-
-def _mean(values: Sequence[float]) -> float:
-    """Mean of those that are defined; NaN where none is."""
-    defined = [value for value in values if not np.isnan(value)]
-    return float(np.mean(defined)) if defined else float("nan")
 
 
 class StopSignals:

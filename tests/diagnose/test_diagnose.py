@@ -1,7 +1,7 @@
-"""What a diagnosis says of courses that were made up, and of the project's own that stand, fall and walk.
+"""What a diagnosis says of histories that were made up, and of the project's own runs that stand, fall and walk.
 
-``data/courses.json`` holds figures of courses below ``experiments/results``: the first 3 rows and the last 10, those
-with an evaluation, and the best policy's figures where the folder has them.
+``data/histories.json`` holds figures of runs below ``experiments/results``: the first 3 rows and the last 10, those
+with an evaluation, and the best figures where the folder has them.
 """
 
 import json
@@ -54,8 +54,8 @@ EVALUATION = {
 }
 
 
-def course(method="fmp", settings=None, rows=12, **figures):
-    """A healthy course of 3 M transitions, but for ``figures``, named as ``fit_score_spread`` or ``turn``."""
+def history(method="fmp", settings=None, rows=12, **figures):
+    """A healthy history of 3 M transitions, but for ``figures``, named as ``fit_score_spread`` or ``turn``."""
     training, evaluation = dict(TRAINING), dict(EVALUATION)
     for name, value in figures.items():
         section = name.replace("_", "/", 1)
@@ -63,7 +63,7 @@ def course(method="fmp", settings=None, rows=12, **figures):
         (training if section in training else evaluation)[section if section in training else name] = value
     table = [dict(training) for _ in range(rows)]
     table[-2]["eval/quality"], table[-1]["eval/quality"] = 0.8, evaluation["quality"]
-    return diagnose.Course(table, preset("laptop", method=method, **(settings or {})), evaluation)
+    return diagnose.History(table, preset("laptop", method=method, **(settings or {})), evaluation)
 
 
 # Each rule at the last healthy figure and just beyond it.
@@ -126,8 +126,8 @@ BOUNDS = [
 
 @pytest.mark.parametrize(("name", "healthy", "sick"), BOUNDS, ids=[name for name, *_ in BOUNDS])
 def test_a_rule_fires_beyond_its_bound_and_not_at_it(name, healthy, sick):
-    assert name not in diagnose.symptoms(course(**healthy))
-    said = diagnose.symptoms(course(**sick))[name]
+    assert name not in diagnose.symptoms(history(**healthy))
+    said = diagnose.symptoms(history(**sick))[name]
     rule = RULES[name]
     assert (
         f"{rule.figure} is " in said
@@ -149,11 +149,11 @@ def test_every_rule_is_tried_at_its_bound():
     ],
 )
 def test_a_healthy_course_earns_one_sentence(method):
-    assert diagnose.report(course(method)) == ["No symptom: every figure that was checked is in its healthy range."]
+    assert diagnose.report(history(method)) == ["No symptom: every figure that was checked is in its healthy range."]
 
 
 def test_a_sentence_names_the_figure_the_range_and_the_setting():
-    said = diagnose.symptoms(course(late_speed=0.02, excursion=0.1))
+    said = diagnose.symptoms(history(late_speed=0.02, excursion=0.1))
     assert said == {
         "stands": "It stands, at 0.02 m/s where the demonstration goes at 1.00: excursion is 0.1, healthy is at least "
         "0.5; look at ppo.discount (now 0.97) and method (now fmp)."
@@ -161,9 +161,9 @@ def test_a_sentence_names_the_figure_the_range_and_the_setting():
 
 
 def test_settings_of_another_reward_are_not_named():
-    assert "prior." not in diagnose.symptoms(course("amp", fit_expert_margin=-1))["margin negative"]
-    assert "amp." not in diagnose.symptoms(course("value", fit_expert_margin=-1))["margin negative"]
-    said = diagnose.symptoms(course("gail", fit_discriminator_loss=0.01))["discriminator saturated"]
+    assert "prior." not in diagnose.symptoms(history("amp", fit_expert_margin=-1))["margin negative"]
+    assert "amp." not in diagnose.symptoms(history("value", fit_expert_margin=-1))["margin negative"]
+    said = diagnose.symptoms(history("gail", fit_discriminator_loss=0.01))["discriminator saturated"]
     assert "look at gail.gradient_penalty (now 0.0), gail.learning_rate" in said and "amp." not in said
 
 
@@ -175,71 +175,71 @@ def test_settings_of_another_reward_are_not_named():
     ],
 )
 def test_where_most_episodes_fall_the_gait_is_not_judged(figures):
-    found, lacking = sentences.apply_rules(course(**figures))
+    found, lacking = sentences.apply_rules(history(**figures))
     assert list(found) in (["falls early"], ["falls late"]) and not set(lacking) - {"eval/excursion"}
 
 
 def test_a_demonstration_that_stands_has_no_pace():
-    assert not diagnose.symptoms(course(demonstration_speed=0.05, late_speed=0.0, path_speed=0.0))
+    assert not diagnose.symptoms(history(demonstration_speed=0.05, late_speed=0.0, path_speed=0.0))
 
 
 def test_where_the_demonstration_turns_the_pace_is_along_the_own_heading():
     turning = dict(demonstration_turn=0.5, demonstration_turning=0.5, turn=0.5, late_speed=-0.4)
-    assert not diagnose.symptoms(course(**turning))
-    assert list(diagnose.symptoms(course(**turning, path_speed=2.0))) == ["too fast"]
-    standing = diagnose.symptoms(course(**turning, path_speed=0.02, excursion=0.1))["stands"]
+    assert not diagnose.symptoms(history(**turning))
+    assert list(diagnose.symptoms(history(**turning, path_speed=2.0))) == ["too fast"]
+    standing = diagnose.symptoms(history(**turning, path_speed=0.02, excursion=0.1))["stands"]
     assert standing.startswith("It stands, at 0.02 m/s where the demonstration goes at 1.00")
 
 
 def test_left_and_right_turns_that_cancel_are_not_judged():
-    assert not diagnose.symptoms(course(demonstration_turn=0.1, demonstration_turning=0.6, turn=0.4))
+    assert not diagnose.symptoms(history(demonstration_turn=0.1, demonstration_turning=0.6, turn=0.4))
 
 
 def test_a_demonstration_that_limps_may_be_followed():
     ranges = [60, 60, 60, 30, 30, 30]  # an imbalance of 2/3
-    assert not diagnose.symptoms(course(imbalance=0.9, expert_ranges=ranges))
-    assert "limps" in diagnose.symptoms(course(imbalance=1.1, expert_ranges=ranges))
+    assert not diagnose.symptoms(history(imbalance=0.9, expert_ranges=ranges))
+    assert "limps" in diagnose.symptoms(history(imbalance=1.1, expert_ranges=ranges))
 
 
 def test_without_a_target_the_divergence_is_not_judged():
-    assert not diagnose.symptoms(course(ppo_kl=1.0, settings={"ppo.target_kl": 0.0}))
+    assert not diagnose.symptoms(history(ppo_kl=1.0, settings={"ppo.target_kl": 0.0}))
 
 
 def test_training_figures_are_means_of_the_last_rows_without_the_first():
-    made = course(rows=6)
+    made = history(rows=6)
     made.rows[0]["ppo/kl"] = 100.0
     assert not diagnose.symptoms(made)
-    long = course(rows=30)
+    long = history(rows=30)
     for row in long.rows[:20]:
         row["train/falls"] = 1.0
     assert not diagnose.symptoms(long)
     long.rows[20]["train/falls"] = 1.0
-    assert diagnose.Course(long.rows, long.config, long.evaluation)["train/falls"] == pytest.approx(0.1)
-    only = course(rows=2)
-    assert diagnose.symptoms(diagnose.Course(only.rows[:1], only.config, {"quality": 0.8})) == {}
+    assert diagnose.History(long.rows, long.config, long.evaluation)["train/falls"] == pytest.approx(0.1)
+    only = history(rows=2)
+    assert diagnose.symptoms(diagnose.History(only.rows[:1], only.config, {"quality": 0.8})) == {}
 
 
 @pytest.mark.parametrize("name", [*TRAINING, *(f"eval/{name}" for name in EVALUATION)])
 def test_a_missing_figure_silences_its_rules_and_is_named(name):
-    made = course(fit_skipped=1)
+    made = history(fit_skipped=1)
     evaluation = {k: v for k, v in made.evaluation.items() if f"eval/{k}" != name}
     rows = [{k: v for k, v in row.items() if k != name or k == "transitions"} for row in made.rows]
-    found, lacking = sentences.apply_rules(diagnose.Course(rows, made.config, evaluation))
+    found, lacking = sentences.apply_rules(diagnose.History(rows, made.config, evaluation))
     assert set(found) == {"reward updates skipped"} - set(lacking.get("fit/skipped", []))
     of_amp = ("fit/discriminator_loss", "fit/agent_accuracy")
     of_falls = ("env/cap", "train/episode_length", "eval/mean_length")
     of_turns = ("eval/path_speed", "eval/demonstration_turning")  # the demonstration goes straight
     assert (name in lacking) == (name not in ("transitions", *of_amp, *of_falls, *of_turns))
     if lacking:
-        assert diagnose.report(diagnose.Course(rows, made.config, evaluation))[-1] == (
+        assert diagnose.report(diagnose.History(rows, made.config, evaluation))[-1] == (
             f"Not checked: {', '.join(lacking[name])} (no {name})."
         )
 
 
 def test_a_run_without_an_evaluation_says_what_it_could_not_check():
-    made = course()
+    made = history()
     rows = [{k: v for k, v in row.items() if k != "eval/quality"} for row in made.rows]
-    said = diagnose.report(diagnose.Course(rows, made.config, diagnose.newest(rows)))
+    said = diagnose.report(diagnose.History(rows, made.config, diagnose.newest(rows)))
     assert said[0].startswith("No symptom") and len(said) == 2
     assert (
         said[1].startswith("Not checked: falls early, falls late, stands, ")
@@ -250,13 +250,13 @@ def test_a_run_without_an_evaluation_says_what_it_could_not_check():
 @pytest.mark.parametrize(("reset", "settled"), diagnose.SETTLED.items())
 def test_symptoms_early_in_a_run_are_put_in_their_place(reset, settled):
     settings = {"env.reset": reset, "transitions": round(3e6 / settled)}
-    assert "good runs" not in diagnose.text(course(train_falls=1.0, settings=settings))
+    assert "good runs" not in diagnose.text(history(train_falls=1.0, settings=settings))
     settings["transitions"] += 100_000
-    assert f"up to {100 * settled:.0f} %" in diagnose.text(course(train_falls=1.0, settings=settings))
-    assert "good runs" not in diagnose.text(course(settings=settings))
+    assert f"up to {100 * settled:.0f} %" in diagnose.text(history(train_falls=1.0, settings=settings))
+    assert "good runs" not in diagnose.text(history(settings=settings))
 
 
-# --- the project's own courses ---------------------------------------------------------------------------------------
+# --- the project's own runs -------------------------------------------------------------------------------------------
 
 SYMPTOMS = {
     "lafan1_standing": ["falls early", "falls in training", "stands"],
@@ -278,8 +278,8 @@ SYMPTOMS = {
 
 
 @pytest.fixture(scope="module")
-def courses(data):
-    recorded = json.loads((data / "courses.json").read_text())
+def histories(data):
+    recorded = json.loads((data / "histories.json").read_text())
     made = {}
     for name, kept in recorded.items():
         rows = [dict(zip(kept["columns"], row, strict=True)) for row in kept["rows"]]
@@ -289,9 +289,9 @@ def courses(data):
 
 
 @pytest.mark.parametrize("name", SYMPTOMS)
-def test_the_last_policy_of_a_course(courses, name):
-    rows, config, _ = courses[name]
-    made = diagnose.Course(rows, config, diagnose.newest(rows))
+def test_the_last_policy_of_a_run(histories, name):
+    rows, config, _ = histories[name]
+    made = diagnose.History(rows, config, diagnose.newest(rows))
     found, lacking = sentences.apply_rules(made)
     assert list(found) == SYMPTOMS[name]
     # Courses from before turning was measured do not say how the policy turns.
@@ -300,9 +300,9 @@ def test_the_last_policy_of_a_course(courses, name):
 
 
 @pytest.mark.parametrize("name", ["lafan1_walk", "lafan1_walk_seed1", "lafan1_fixed", "bundled_walk", "run1_jog"])
-def test_the_best_policy_of_a_walk_has_no_symptom(courses, name):
-    rows, config, best = courses[name]
-    assert diagnose.symptoms(diagnose.Course(rows, config, best)) == {}
+def test_the_best_policy_of_a_walk_has_no_symptom(histories, name):
+    rows, config, best = histories[name]
+    assert diagnose.symptoms(diagnose.History(rows, config, best)) == {}
 
 
 def test_no_rule_is_for_a_method_or_a_setting_that_does_not_exist():
@@ -326,7 +326,7 @@ def test_the_page_has_the_ranges_of_the_rules():
 @pytest.fixture
 def folder(tmp_path):
     """A run's folder: its last policy stands, the best one walks."""
-    made = course(late_speed=0.0, path_speed=0.0, excursion=0.1, quality=0.7)
+    made = history(late_speed=0.0, path_speed=0.0, excursion=0.1, quality=0.7)
     last = {f"eval/{name}": value for name, value in made.evaluation.items()}
     rows = [made.rows[0], *made.rows[1:-1], made.rows[-1] | last]
     names = ["iteration", "seconds", *rows[-1]]

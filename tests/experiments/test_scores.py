@@ -14,7 +14,7 @@ import pytest
 from fmpjax.errors import UserError
 from fmpjax.experiments import benchmark
 from fmpjax.experiments.common import comparison, explorer, scores, statistics
-from fmpjax.experiments.common.scores import Course, Result
+from fmpjax.experiments.common.scores import History, Result
 from fmpjax.experiments.common.statistics import Estimate
 from fmpjax.experiments.common.table import Row
 
@@ -29,10 +29,10 @@ def row(transitions=100, seconds=10.0, method="fmp", motion="walk", seed=0, **fi
     return Row(f"{method}/{seed}", method, "dataset", motion, seed, transitions, seconds, GOOD | figures)
 
 
-def course(rows, machines=("2 CPU cores",)):
+def history(rows, machines=("2 CPU cores",)):
     first = rows[0]
     config = SimpleNamespace(method=first.method, seed=first.seed, env=SimpleNamespace(reset=first.reset))
-    return Course(SimpleNamespace(config=config, variant=first.variant), rows, 30.0, frozenset(machines))
+    return History(SimpleNamespace(config=config, variant=first.variant), rows, 30.0, frozenset(machines))
 
 
 # --- scores of a cell ------------------------------------------------------------------------------------------------
@@ -78,8 +78,8 @@ def test_time_to_walk_is_of_the_first_evaluation_that_walks():
 
 def test_equal_transitions_take_the_last_evaluation_and_equal_wall_time_the_nearest():
     """The fast method spends its budget in 30 s on average; the slow one has an evaluation each 20 s."""
-    fast = [course([row(100, 15.0, "amp", seed=s), row(200, end, "amp", seed=s)]) for s, end in ((0, 29.0), (1, 31.0))]
-    slow = course([row(50, 21.0, falls=5.0), row(100, 38.0, quality=0.5), row(200, 80.0)])
+    fast = [history([row(100, 15.0, "amp", seed=s), row(200, end, "amp", seed=s)]) for s, end in ((0, 29.0), (1, 31.0))]
+    slow = history([row(50, 21.0, falls=5.0), row(100, 38.0, quality=0.5), row(200, 80.0)])
     found = {(r.method, r.seed, r.budget): r for r in scores.results([*fast, slow])}
     assert {(key[2], r.transitions) for key, r in found.items() if key[0] == "amp"} == {
         ("transitions", 200), ("seconds", 200),
@@ -89,19 +89,19 @@ def test_equal_transitions_take_the_last_evaluation_and_equal_wall_time_the_near
     assert (equal.transitions, equal.seconds, equal.scores["quality"]) == (100, 38.0, 0.5)
     # Until then it had walked once; at equal transitions no other way.
     assert (equal.walk_transitions, equal.walk_seconds) == (100.0, 38.0)
-    early = course([row(50, 29.0, falls=5.0), row(200, 60.0)])
+    early = history([row(50, 29.0, falls=5.0), row(200, 60.0)])
     (never,) = (r for r in scores.results([*fast, early]) if (r.method, r.budget) == ("fmp", "seconds"))
     assert math.isnan(never.walk_transitions)
     # Another motion has a time of its own.
-    other = course([row(100, 50.0, motion="turn"), row(200, 100.0, motion="turn")])
+    other = history([row(100, 50.0, motion="turn"), row(200, 100.0, motion="turn")])
     (found,) = (r for r in scores.results([*fast, other]) if (r.motion, r.budget) == ("turn", "seconds"))
     assert found.seconds == 100.0
 
 
 def test_wall_times_of_different_machines_are_not_compared():
-    courses = [course([row(seed=0)]), course([row(seed=1)], ["1 CPU cores"])]
-    assert {each.budget for each in scores.results(courses)} == {"transitions"}
-    record = {"cells": {"planned": 3, "finished": 2}, "machines": scores.machines(courses)}
+    histories = [history([row(seed=0)]), history([row(seed=1)], ["1 CPU cores"])]
+    assert {each.budget for each in scores.results(histories)} == {"transitions"}
+    record = {"cells": {"planned": 3, "finished": 2}, "machines": scores.machines(histories)}
     said = benchmark.notes(record)
     assert said[0] == "2 of 3 cells are finished." and "(1 CPU cores, 2 CPU cores), whose wall times do not" in said[-1]
 

@@ -1,6 +1,6 @@
 """Scores of the cells of a benchmark: of each cell's evaluation at equal transitions, and of that at equal wall time.
 
-A run's course has both, since every evaluation says how many transitions and how many seconds of training it is after.
+A run's history has both, since every evaluation says how many transitions and how many seconds of training it is after.
 """
 
 import json
@@ -44,7 +44,7 @@ SCORES = (
 BUDGETS = ("transitions", "seconds")  # what is equal
 
 
-class Course(NamedTuple):
+class History(NamedTuple):
     """A finished cell: its evaluations and what else its scores need."""
 
     cell: Cell
@@ -72,13 +72,13 @@ class Result(NamedTuple):
         return {k: v for k, v in self._asdict().items() if k != "scores"} | self.scores
 
 
-def read(cell: Cell, folder: Path) -> Course:
-    """The course of a finished cell."""
+def read(cell: Cell, folder: Path) -> History:
+    """The history of a finished cell."""
     run = folder / cell.name
     made = json.loads((run / "provenance.json").read_text())
     ranges = json.loads((run / "evaluation.json").read_text())["expert_ranges"]
     machines = frozenset(f"{each['device']}" for each in (made, *made.get("resumed", [])))
-    return Course(cell, table.evaluations(cell, folder), float(np.mean(ranges)), machines)
+    return History(cell, table.evaluations(cell, folder), float(np.mean(ranges)), machines)
 
 
 def walks(row: Row) -> bool:
@@ -117,44 +117,44 @@ def scores(row: Row, still: float) -> dict[str, float]:
     }
 
 
-def machines(courses: Sequence[Course]) -> list[str]:
+def machines(histories: Sequence[History]) -> list[str]:
     """The kinds of machine that trained the cells; wall times of several kinds do not compare."""
-    return sorted({machine for course in courses for machine in course.machines})
+    return sorted({machine for history in histories for machine in history.machines})
 
 
-def results(courses: Sequence[Course]) -> list[Result]:
+def results(histories: Sequence[History]) -> list[Result]:
     """The scores of every cell at equal transitions and, where one kind of machine trained all, at equal wall time.
 
     At equal transitions the last evaluation counts. At equal wall time it is, for each motion and reset, the evaluation
     nearest to the mean time in which the fastest method spends its budget.
     """
-    found = [_result(course, course.rows[-1], "transitions") for course in courses]
-    if len(machines(courses)) != 1:
+    found = [_result(history, history.rows[-1], "transitions") for history in histories]
+    if len(machines(histories)) != 1:
         return found
-    limits = _limits(courses)
-    for course in courses:
-        limit = limits[_where(course)]
-        nearest = min(course.rows, key=lambda row: abs(row.seconds - limit))
-        found.append(_result(course, nearest, "seconds"))
+    limits = _limits(histories)
+    for history in histories:
+        limit = limits[_where(history)]
+        nearest = min(history.rows, key=lambda row: abs(row.seconds - limit))
+        found.append(_result(history, nearest, "seconds"))
     return found
 
 
-def _result(course: Course, row: Row, budget: str) -> Result:
-    until = [each for each in course.rows if each.transitions <= row.transitions]
+def _result(history: History, row: Row, budget: str) -> Result:
+    until = [each for each in history.rows if each.transitions <= row.transitions]
     return Result(
         row.method, row.reset, row.variant, row.seed, budget, row.transitions, row.seconds,
-        scores(row, course.still), *time_to_walk(until),
+        scores(row, history.still), *time_to_walk(until),
     )  # fmt: skip
 
 
-def _where(course: Course) -> tuple[str, str]:
-    return course.cell.variant, course.cell.config.env.reset
+def _where(history: History) -> tuple[str, str]:
+    return history.cell.variant, history.cell.config.env.reset
 
 
-def _limits(courses: Sequence[Course]) -> Mapping[tuple[str, str], float]:
+def _limits(histories: Sequence[History]) -> Mapping[tuple[str, str], float]:
     """Seconds of training that are equal, for each motion and reset."""
     spent: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for course in courses:
-        methods = spent.setdefault(_where(course), {})
-        methods.setdefault(course.cell.config.method, []).append(course.rows[-1].seconds)
+    for history in histories:
+        methods = spent.setdefault(_where(history), {})
+        methods.setdefault(history.cell.config.method, []).append(history.rows[-1].seconds)
     return {where: min(float(np.mean(times)) for times in methods.values()) for where, methods in spent.items()}

@@ -17,12 +17,12 @@ RECENT = 10  # rows that a training figure is the mean of: a million transitions
 
 
 class Missing(KeyError):
-    """A figure that a course does not have, or that is not defined in it."""
+    """A figure that a history does not have, or that is not defined in it."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Course:
-    """What a diagnosis reads. ``course["eval/NAME"]`` is of the evaluation, any other a mean over the recent rows."""
+class History:
+    """What a diagnosis reads. ``history["eval/NAME"]`` is of the evaluation, any other a mean over the recent rows."""
 
     rows: Sequence[Mapping[str, Any]]  # of metrics.csv, oldest first; values are numbers, texts of numbers or empty
     config: Config
@@ -33,7 +33,7 @@ class Course:
         """The figure called ``name`` in the units of its column.
 
         Raises:
-          Missing: the course has no such figure.
+          Missing: the history has no such figure.
         """
         if name.startswith("eval/"):
             value = number(name, self.evaluation.get(name.removeprefix("eval/")))
@@ -73,8 +73,8 @@ def _defined(name: str, value: float) -> float:
     return value
 
 
-def read(folder: Path, *, last: bool = False) -> Course:
-    """The course in a run folder or in a folder of exported results.
+def read(folder: Path, *, last: bool = False) -> History:
+    """The history in a run folder or in a folder of exported results.
 
     Args:
       folder: holds ``config.json`` and ``metrics.csv``; ``evaluation.json``, the best policy's, where there is one.
@@ -91,14 +91,14 @@ def read(folder: Path, *, last: bool = False) -> Course:
         raise UserError(f"{folder / 'metrics.csv'} has no rows: expected the metrics of a run that has begun to train")
     path = folder / "evaluation.json"
     if last or not path.exists():
-        return Course(rows, config, newest(rows))
+        return History(rows, config, newest(rows))
     try:
         evaluation = json.loads(path.read_text())
     except ValueError:
         evaluation = None
     if not isinstance(evaluation, dict):
         raise UserError(f"{path} is not valid JSON: expected the figures of an evaluation")
-    return Course(rows, config, evaluation, f"{path.name} (the best policy)")
+    return History(rows, config, evaluation, f"{path.name} (the best policy)")
 
 
 def newest(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
