@@ -12,6 +12,7 @@ from fmpjax import frozen, jsons, metrics, tables
 from fmpjax.commands import velocity
 from fmpjax.frames import FrameLayout
 from fmpjax.ppo import PPOState
+from fmpjax.style import StyleDistance
 from fmpjax.trainer import Trainer
 
 SPEEDS, TURNS = 7, 9  # cells of the grid ahead and turning
@@ -37,6 +38,7 @@ class Cell(NamedTuple):
     turn_error: float  # rad/s, the same of the turning
     drift: float  # m/s to the left of what is commanded, mean of absolute values
     sideways: float = 0.0  # m/s to the left, commanded
+    style: float = float("nan")  # distance from the demonstrations, mean of the episodes that stayed up
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +60,8 @@ class Steering:
     changing_sideways_error: float  # m/s
     seconds: float = CONSTANT  # of an episode under a constant command
     changing_seconds: float = LEG * LEGS
+    style: float = float("nan")  # distance from the nearest window of the demonstrations, mean over the cells
+    changing_style: float = float("nan")  # the same of all episodes under changing commands, up to a fall
 
     def to_json(self) -> str:
         """All figures; what is not defined is null."""
@@ -85,14 +89,17 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 256, each: int
     told = np.repeat(grid, each, axis=0)[None]
     steps = round(CONSTANT * rate)
     played = play(trainer, state, np.repeat(told, steps, axis=0), rng)
-    reached = np.where(played.fell[:, None], np.nan, played.velocity[round(SETTLING * rate) :].mean(0))
-    cells = _cells(grid, reached.reshape(len(grid), each, 3), played.fell.reshape(len(grid), each))
+    distance, settled = StyleDistance(trainer), round(SETTLING * rate)
+    style = distance(played.frames[settled:], played.alive[settled:])
+    reached = np.where(played.fell[:, None], np.nan, played.velocity[settled:].mean(0))
+    by_cell = len(grid), each
+    cells = _cells(grid, reached.reshape(*by_cell, 3), played.fell.reshape(by_cell), style.reshape(by_cell))
     plane, aside = cells[: SPEEDS * TURNS], cells[SPEEDS * TURNS :]
     straight = [cell for cell in plane if cell.turn == 0 and cell.ahead > 0]
     still = np.flatnonzero((grid == 0).all(1))
     place = played.qpos[..., :2]
-    way = np.linalg.norm(place[-1] - place[round(SETTLING * rate)], axis=-1) / (CONSTANT - SETTLING)
-    way = np.where(played.fell, np.nan, way).reshape(len(grid), each)
+    way = np.linalg.norm(place[-1] - place[settled], axis=-1) / (CONSTANT - SETTLING)
+    way = np.where(played.fell, np.nan, way).reshape(by_cell)
 
     legs = rng.uniform(low, high, (LEGS, episodes, 3))
     legs[rng.uniform(size=(LEGS, episodes)) < ZERO] = 0.0
@@ -114,6 +121,8 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = 256, each: int
         changing_speed_error=metrics.mean(off[:, 0]),
         changing_turn_error=metrics.mean(off[:, 2]),
         changing_sideways_error=metrics.mean(off[:, 1]),
+        style=metrics.mean([cell.style for cell in plane]),
+        changing_style=metrics.mean(distance(moved.frames, moved.alive)),
     )
 
 
@@ -141,6 +150,7 @@ class Played(NamedTuple):
 
     velocity: np.ndarray  # [T, N, 3] in the heading frame: m/s, m/s, rad/s
     qpos: np.ndarray  # [T, N, nq]
+    frames: np.ndarray  # [T, N, F] compact
     alive: np.ndarray  # [T, N] bool
     fell: np.ndarray  # [N] bool
 
@@ -168,18 +178,19 @@ def _play(trainer: Trainer, state: PPOState, rows: jax.Array, told: jax.Array):
         return (reached, taken.alive), (
             layout.heading_velocity(reached.observed.frame),
             reached.physics.qpos,
+            reached.observed.frame,
             taken.alive,
         )
 
     drawn = env.disturbance_draws(jax.random.PRNGKey(0), len(told), len(rows))
-    (_, alive), (velocities, qpos, lives) = jax.lax.scan(step, (start, jnp.ones(len(rows), bool)), (told, drawn))
-    return velocities, qpos, lives, ~alive
+    (_, alive), played = jax.lax.scan(step, (start, jnp.ones(len(rows), bool)), (told, drawn))
+    return *played, ~alive
 
 
-def _cells(grid: np.ndarray, reached: np.ndarray, fell: np.ndarray) -> list[Cell]:
-    """Figures of each command ``[C, 3]`` from mean velocities ``[C, E, 3]`` and falls ``[C, E]``."""
+def _cells(grid: np.ndarray, reached: np.ndarray, fell: np.ndarray, style: np.ndarray) -> list[Cell]:
+    """Figures of each command ``[C, 3]`` from mean velocities ``[C, E, 3]``, falls and style distances ``[C, E]``."""
     cells = []
-    for command, means, falls in zip(grid, reached, fell, strict=True):
+    for command, means, falls, distances in zip(grid, reached, fell, style, strict=True):
         off = np.abs(means - command)
         cells.append(
             Cell(
@@ -193,6 +204,7 @@ def _cells(grid: np.ndarray, reached: np.ndarray, fell: np.ndarray) -> list[Cell
                 turn_error=metrics.mean(off[:, 2]),
                 drift=metrics.mean(off[:, 1]),
                 sideways=float(command[1]),
+                style=metrics.mean(distances[~falls]),
             )
         )
     return cells
@@ -208,10 +220,12 @@ def table(steering: Steering) -> str:
         ("mean error to the sides", f"{s.sideways_error:.3f}", "m/s, commands to the sides"),
         ("turning when told to go straight", f"{s.straight_turn:.3f}", "rad/s"),
         ("speed when told to stand", f"{s.standing_speed:.3f}", "m/s over the floor"),
+        ("distance from the demonstrations", f"{s.style:.3f}", "standard deviations, nearest windows"),
         ("mean error of the speed", f"{s.changing_speed_error:.3f}", f"m/s, a new command every {LEG:g} s"),
         ("mean error of the turning", f"{s.changing_turn_error:.3f}", "rad/s"),
         ("mean error to the sides", f"{s.changing_sideways_error:.3f}", "m/s"),
         ("falls", f"{s.changing_falls} of {s.changing_episodes}", f"in {s.changing_seconds:g} s"),
+        ("distance from the demonstrations", f"{s.changing_style:.3f}", "standard deviations"),
     ]
     aside = any(cell.sideways for cell in s.cells)
     return tables.lines("  {:<36} {:>20}  {}", [row for row in rows if aside or "sides" not in row[0]])
@@ -226,6 +240,7 @@ def maps(steering: Steering) -> tuple[list[float], list[float], dict[str, np.nda
         "speed_error": "mean error of the speed, m/s",
         "turn_error": "mean error of the turning, rad/s",
         "falls": f"falls of {plane[0].episodes} episodes",
+        "style": "distance from the demonstrations",
     }
     values = {t: np.array([getattr(cell, n) for cell in plane], float).reshape(shape) for n, t in titles.items()}
     return speeds, turns, values

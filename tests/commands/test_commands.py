@@ -400,6 +400,7 @@ def test_a_run_is_told_velocities_and_measured(told, capsys, monkeypatch):
     cli.main(["evaluate", str(told), "--commands", "--episodes", "4"])
     assert "turning when told to go straight" in capsys.readouterr().out
     found = json.loads((told / "steering.json").read_text())
+    assert 0 < found["changing_style"] < 10
     assert found["changing_episodes"] == 4 and len(found["cells"]) == steering.SPEEDS * steering.TURNS
     assert (told / "steering.png").stat().st_size > 10_000
     cli.main(["render", str(told), "--course", "0.3:0.4,0,0.2", "0.2:0,0,0"])
@@ -433,8 +434,8 @@ def test_commands_to_the_sides_are_tried_where_there_are_any():
 def test_figures_of_cells():
     grid = np.array([[0.5, 0.0, 0.2]])
     reached = np.array([[[0.6, 0.1, 0.1], [0.3, -0.1, 0.5], [np.nan] * 3]])
-    (cell,) = steering._cells(grid, reached, np.array([[False, False, True]]))
-    assert (cell.episodes, cell.falls) == (3, 1)
+    (cell,) = steering._cells(grid, reached, np.array([[False, False, True]]), np.array([[0.1, 0.3, 5.0]]))
+    assert (cell.episodes, cell.falls) == (3, 1) and cell.style == pytest.approx(0.2)
     np.testing.assert_allclose([cell.speed, cell.turned], [0.45, 0.3])
     np.testing.assert_allclose([cell.speed_error, cell.turn_error, cell.drift], [0.15, 0.2, 0.1])
     assert dataclasses.is_dataclass(steering.Steering)
