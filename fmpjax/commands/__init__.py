@@ -40,4 +40,6 @@ def combine(config: CommandConfig, prior: jax.Array, command: jax.Array) -> jax.
     """The reward of steps whose motion earns ``prior`` and whose obedience earns ``command``, of the same shape."""
     if config.combine == "prior":
         return prior
+    if config.combine == "command":
+        return command
     return prior * command if config.combine == "product" else prior + config.weight * command

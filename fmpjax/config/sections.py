@@ -103,8 +103,8 @@ class CommandConfig(Section):
 
     # command: none [P], a velocity in the heading frame, the time in the clip ("phase"), or one of several motions [D]
     kind: Literal["none", "velocity", "phase", "motion"] = "none"
-    # how the prior's reward and the command's are combined; "prior": only the prior's counts [D]
-    combine: Literal["product", "sum", "prior"] = "product"
+    # how the prior's reward and the command's are combined; "prior" and "command": only that one's counts [D]
+    combine: Literal["product", "sum", "prior", "command"] = "product"
     weight: PositiveFloat = 1.0  # weight of the command's reward in a sum [D]
     hold: tuple[float, ...] = (1.0, 3.0)  # s, shortest and longest time until a new velocity or motion is drawn [D]
     zero: Annotated[float, Meta(ge=0, le=1)] = 0.1  # share of the drawn velocities that are zero [D]

@@ -303,6 +303,7 @@ def test_product_and_sum():
     joined = commands.combine(CommandConfig(combine="sum", weight=2.0), prior, obeyed)
     np.testing.assert_array_equal(joined, [2.0, 2.5])
     np.testing.assert_array_equal(commands.combine(CommandConfig(combine="prior"), prior, obeyed), prior)
+    np.testing.assert_array_equal(commands.combine(CommandConfig(combine="command"), prior, obeyed), obeyed)
 
 
 @pytest.mark.parametrize(
