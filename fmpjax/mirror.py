@@ -51,6 +51,9 @@ def make(robot: Robot, form: str, actions: ActionMap) -> Mirror:
         row_of = np.delete(rows, cut)  # of each joint
         rotations = rows.copy()
         rotations[row_of] = row_of[joints]
+    # The center of the actions is a pose, which may have a mirror image of its own.
+    shift = sign * actions.center[joints] - actions.center
+    action = Reflection(joints, sign * actions.scale[joints] / actions.scale, shift / actions.scale)
     parts = {
         "root_height": (np.arange(1), np.ones(1)),
         "velocity_commands": (np.arange(3), np.array([1, -1, -1])),
@@ -58,6 +61,11 @@ def make(robot: Robot, form: str, actions: ActionMap) -> Mirror:
         "joint_position": (joints, sign),
         "joint_velocity": (joints, sign),
         "joint_rotation_6d": _blocks(rotations, SIX),
+        "base_ang_vel": _blocks(np.arange(1), TURN),
+        "projected_gravity": _blocks(np.arange(1), VECTOR),
+        "joint_pos_rel": (joints, sign, shift),
+        "joint_vel_rel": (joints, sign),
+        "last_action": action,
     }
     for axes in ("root", "heading"):
         parts[f"{axes}_rotation_6d"] = _blocks(np.arange(1), SIX)
@@ -65,19 +73,16 @@ def make(robot: Robot, form: str, actions: ActionMap) -> Mirror:
         parts[f"{axes}_angular_velocity"] = _blocks(np.arange(1), TURN)
     for name in ("key_points", "heading_key_points"):
         parts[name] = _blocks(np.array(points), VECTOR)
-    order, signs, start = [], [], 0
+    found, start = [], 0
     for name, width in observation_terms(robot, form).items():
         if name not in parts:
             raise UserError(f"setting ppo.mirror is not 0: the mirror image of the observation's {name} is not known")
-        order.append(start + parts[name][0])
-        signs.append(parts[name][1])
+        order, signs, *moved = parts[name]
+        for first in range(start, start + width, len(order)):  # more than one where the observation has a history
+            found.append((first + order, signs, moved[0] if moved else np.zeros(len(order))))
         start += width
-    # The center of the actions is a pose, which may have a mirror image of its own.
-    shift = (sign * actions.center[joints] - actions.center) / actions.scale
-    return Mirror(
-        Reflection(np.concatenate(order), np.concatenate(signs).astype(float), np.zeros(start)),
-        Reflection(joints, sign * actions.scale[joints] / actions.scale, shift),
-    )
+    order, signs, moved = (np.concatenate(each) for each in zip(*found, strict=True))
+    return Mirror(Reflection(order, signs.astype(float), moved), action)
 
 
 def _blocks(order: np.ndarray, sign: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,6 @@ from flax import linen
 from fmpjax import learning, machine, sharding
 from fmpjax.acting import ActionRule, Seen, of_actor, of_critic
 from fmpjax.config import PPOConfig
-from fmpjax.errors import UserError
 from fmpjax.mirror import Mirror
 
 machine.import_mjx()  # which Brax imports
@@ -99,10 +98,6 @@ class PPO:
         clock: int = 0,
         mirror: Mirror | None = None,
     ):
-        if mirror is not None and isinstance(observation_size, Seen):
-            raise UserError(
-                f"setting ppo.mirror is {config.mirror:g}: expected 0 where the critic sees more than the policy"
-            )
         self.config, self.clock, self.mirror = config, clock, mirror
         self.observation_size, self.action_size = observation_size, action_size
         activation, initializers = learning.activation(config.activation), jax.nn.initializers
@@ -230,7 +225,8 @@ class PPO:
             }
             loss = surrogate + config.bound_penalty * bound
             if self.mirror is not None:
-                other, _ = self.policy(params, state.normalizer, self.mirror.observation(samples.observation))
+                image = self.mirror.observation(of_actor(samples.observation))
+                other, _ = self.policy(params, state.normalizer, image)
                 off = jnp.mean(jnp.sum((other - self.mirror.action(mean)) ** 2, axis=-1))
                 loss, stats = loss + config.mirror * off, stats | {"asymmetry": off}
             return loss, stats

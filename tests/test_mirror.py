@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fmpjax import features, mirror, motion, robots
+from fmpjax import features, mirror, motion, robots, rotations
 from fmpjax.actions import action_map
 from fmpjax.errors import UserError
 from fmpjax.motion import edit
@@ -52,8 +52,32 @@ def test_mirrored_actions_have_mirrored_targets(robot, walk, kind):
 def test_what_has_no_image_is_refused(robot, walk):
     with pytest.raises(UserError, match="ppo.mirror is not 0: the mirror image of the observation's clip_phase is not"):
         Trainer(tiny(**{"ppo.mirror": 1.0, "command.kind": "phase"}), walk)
-    with pytest.raises(UserError, match="setting ppo.mirror is 1: expected 0 where the critic sees more"):
-        Trainer(tiny(**{"ppo.mirror": 1.0, "disturbance.friction": (0.5, 1.0)}), walk)
+
+
+def test_the_image_of_what_sensors_see_is_that_of_the_mirrored_motion(robot, walk):
+    """Two steps of history. The last actions are those that hold the joints where they are."""
+    part = dataclasses.replace(walk, qpos=walk.qpos[:31])  # its mean pose is not symmetric
+    actions = action_map(robot, part, "residual")
+    image = mirror.make(robot, "deployable velocity history-2", actions).observation
+
+    def sensed(clip, told):
+        joints = clip.qpos[:, 7:] - actions.center
+        down = rotations.rotate(rotations.conjugate(clip.qpos[:, 3:7]), np.array([0.0, 0.0, -1.0]))
+        told = np.broadcast_to(told, (len(joints), 3))
+        terms = clip.qvel[:, 3:6], down, told, joints, clip.qvel[:, 6:], joints / actions.scale
+        return jnp.concatenate([each[i : len(each) - 1 + i] for each in terms for i in (0, 1)], axis=-1)
+
+    ours = sensed(walk, [0.4, 0.1, 0.2])
+    theirs = sensed(edit.mirrored(robot, walk), [0.4, -0.1, -0.2])
+    np.testing.assert_allclose(image(ours), theirs, atol=2e-4)
+    assert np.abs(ours - theirs).max() > 0.1
+
+
+def test_a_policy_that_sees_less_than_the_critic_is_mirrored_too(walk):
+    changes = {"ppo.mirror": 1.0, "env.observation": "deployable", "disturbance.friction": (0.5, 1.0)}
+    trainer = Trainer(tiny(**changes), walk)
+    _, figures = jax.eval_shape(trainer.iteration, trainer.shapes())
+    assert "ppo/asymmetry" in figures
 
 
 def test_an_update_teaches_both_sides_what_was_seen_on_one():
