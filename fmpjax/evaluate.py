@@ -350,25 +350,30 @@ def _listed(motions: tuple[Share, ...]) -> list[Share]:
     return sorted(motions, key=lambda share: -share.falls)[:LISTED]
 
 
+def _shown(value: float, layout: str) -> str:
+    """A figure as text; one that is not defined as a dash."""
+    return format(value, layout) if np.isfinite(value) else "–"
+
+
 def table(evaluation: Evaluation) -> str:
     """The figures as a table for people."""
     e = evaluation
     rows = [
         ("mean episode length", f"{e.mean_length:.1f}", "steps"),
         ("falls", f"{e.falls} of {e.episodes}", f"joint noise of {e.noise:g} rad at the start, as in all below"),
-        ("late forward speed", f"{e.late_speed:.3f} ± {e.late_deviation:.3f}", f"m/s, n = {e.late_n}"),
-        ("speed along its own heading", f"{e.path_speed:.3f}", f"m/s, turning at {e.turn:+.3f} rad/s"),
+        ("late speed", f"{_shown(e.late_speed, '.3f')} ± {_shown(e.late_deviation, '.3f')}", f"m/s, n = {e.late_n}"),
+        ("along its own heading", _shown(e.path_speed, ".3f"), f"m/s, turning at {_shown(e.turn, '+.3f')} rad/s"),
         ("demonstration's speed", f"{e.demonstration_speed:.3f}", f"m/s, turning at {e.demonstration_turn:+.3f} rad/s"),
-        ("excursion", f"{e.excursion:.3f}", f"of the expert's, n = {e.excursion_n}"),
-        ("amplitude MAE", f"{e.amplitude_mae:.2f}", "degrees"),
+        ("excursion", _shown(e.excursion, ".3f"), f"of the demonstration's, n = {e.excursion_n}"),
+        ("amplitude error", _shown(e.amplitude_mae, ".2f"), "degrees"),
         ("Sinkhorn discrepancy", f"{e.discrepancy:.4f}", "in the paper's features"),
-        ("foot speed in contact", f"{e.contact_foot_speed:.3f}", "m/s"),
+        ("foot speed in contact", _shown(e.contact_foot_speed, ".3f"), "m/s"),
         ("rate of the joint targets", f"{e.action_rate:.2f}", f"rad/s; jerk of the joints {e.joint_jerk:.0f} rad/s³"),
         ("power of the servos", f"{e.power:.0f}", "W, mechanical"),
-        ("left-right imbalance", f"{e.imbalance:.3f}", ""),
+        ("left-right imbalance", _shown(e.imbalance, ".3f"), ""),
         ("forward displacement", f"{e.displacement:.2f}", "m"),
         ("leg ranges (hip, knee, ankle; L, R)", " ".join(f"{r:.0f}" for r in e.joint_ranges), "degrees"),
-        ("expert's leg ranges", " ".join(f"{r:.0f}" for r in e.expert_ranges), "degrees"),
+        ("demonstration's leg ranges", " ".join(f"{r:.0f}" for r in e.expert_ranges), "degrees"),
     ]
     if e.obedience is not None:
         rows.append(("obedience", f"{e.obedience:.3f}", "mean of the command's reward before a fall"))
@@ -380,7 +385,7 @@ def table(evaluation: Evaluation) -> str:
     rows += [
         (
             f"from {share.motion}",
-            f"{share.late_speed:.3f}",
+            _shown(share.late_speed, ".3f"),
             f"m/s of {share.demonstration_speed:.3f}, {share.falls} falls in {share.episodes}",
         )
         for share in _listed(e.motions)
