@@ -17,7 +17,7 @@ from fmpjax.experiments import barycenter, curvature, generalization, report, st
 from fmpjax.experiments.common import histories, offline, reference, results, table
 from fmpjax.priors import flow
 from fmpjax.trainer import Trainer
-from tests.helpers import tiny
+from tests.helpers import PROVENANCE, tiny
 
 SMALL = PriorConfig(bank=16, minibatch=16, hidden=(8,))
 
@@ -334,12 +334,6 @@ def test_a_study_from_run_folders_to_its_files(tmp_path, capsys):
 
 
 # --- the report ------------------------------------------------------------------------------------------------------
-
-
-PROVENANCE = {
-    "command": "python -m fmpjax.experiments.x", "date": "2026-01-01", "commit": "0123456789abcdef",
-    "device": "2 CPU cores", "packages": {"jax": "0.10"}, "uncommitted_changes": False,
-}  # fmt: skip
 
 
 def static_record(dynamic=0.3, static=0.4):

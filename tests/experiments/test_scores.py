@@ -17,6 +17,7 @@ from fmpjax.experiments.common import comparison, explorer, scores, statistics
 from fmpjax.experiments.common.scores import History, Result
 from fmpjax.experiments.common.statistics import Estimate
 from fmpjax.experiments.common.table import Row
+from tests.helpers import PROVENANCE
 
 GOOD = {
     "quality": 0.9, "falls": 0.0, "late_speed": 0.9, "path_speed": 0.5, "demonstration_speed": 1.0,
@@ -295,7 +296,6 @@ def test_the_script_sorts_and_filters(tmp_path):
 
 def test_the_report_holds_the_benchmark(tmp_path):
     from fmpjax.experiments import report
-    from tests.experiments.test_reward_experiments import PROVENANCE
 
     results = [
         result(m, s, q, budget=b) for m, q in (("fmp", 0.5), ("amp", 0.6)) for s in (0, 1) for b in scores.BUDGETS
