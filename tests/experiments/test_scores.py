@@ -50,6 +50,21 @@ def test_scores_of_an_evaluation():
     assert scores.scores(row(demonstration_turning=0.5), 30.0)["pace_error"] == pytest.approx(0.5)
 
 
+def test_falls_stand_at_every_size_of_noise():
+    """Also of records that have none, as earlier versions wrote them."""
+    figures = {"falls_at_0": 0.0, "falls_at_0.001": 2.0, "falls_at_0.01": 40.0}
+    assert figures.items() <= scores.scores(row(**figures), 30.0).items()
+    assert math.isnan(scores.scores(row(), 30.0)["falls_at_0.01"])
+    found = record([result(method, seed, 0.5, **figures) for method in ("fmp", "amp") for seed in (0, 1)])
+    headings = comparison.table(found).headings
+    place = headings.index("at 0.01 rad, %")
+    assert headings[place - 3 : place] == ["falls, %", "at 0 rad, %", "at 0.001 rad, %"]
+    assert comparison.table(found).lines[0][place].startswith("40.0 (")
+    found["scores"] = [line for line in found["scores"] if not line["score"].startswith("falls_at")]
+    assert comparison.table(found).lines[0][place] == "–"
+    assert any("joint noise" in note for note in found["notes"])
+
+
 def test_who_falls_early_scores_as_one_who_holds_still():
     undefined = dict.fromkeys(("late_speed", "path_speed", "excursion", "amplitude_mae"), math.nan)
     found = scores.scores(row(falls=100.0, **undefined), still=30.0)
