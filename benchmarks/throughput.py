@@ -73,6 +73,8 @@ def physics_alone(trainer, state) -> Part:
     """A rollout's physics and nothing else, from the environments' present states, of every seed at once."""
     import jax
     import jax.numpy as jnp
+    import mujoco
+    import mujoco.rollout
 
     from fmpjax.physics.native import NativePhysics
 
@@ -88,7 +90,8 @@ def physics_alone(trainer, state) -> Part:
     initial = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)
     control = np.repeat(np.asarray(targets, np.float64)[:, None], steps * backend.substeps, axis=1)
     warmstart = np.asarray(sim.warmstart, np.float64)
-    pool, data = backend._pool, backend._data
+    pool = mujoco.rollout.Rollout(nthread=backend.threads)
+    data = [mujoco.MjData(backend.model) for _ in range(backend.threads)]
     return Part(lambda: pool.rollout(backend.model, data, initial, control, initial_warmstart=warmstart)[0])
 
 

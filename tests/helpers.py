@@ -1,4 +1,4 @@
-"""What several tests make: the smallest run, and the smallest rollout for a prior."""
+"""What several tests make: the smallest run, the smallest rollout for a prior, robots that differ from their model."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +17,8 @@ from fmpjax.config import (
     WAILConfig,
     preset,
 )
+from fmpjax.physics import traits
+from fmpjax.physics.traits import Traits
 from fmpjax.priors import Expert, Rollout
 
 ROOT = Path(__file__).resolve().parents[1]  # of the checkout
@@ -39,6 +41,11 @@ TINY = {
 }
 
 STEPS, COUNT = 8, 32  # of a rollout
+# Of a result, as the report reads it.
+PROVENANCE = {
+    "command": "python -m fmpjax.experiments.x", "date": "2026-01-01", "commit": "0123456789abcdef",
+    "device": "2 CPU cores", "packages": {"jax": "0.10"}, "uncommitted_changes": False,
+}  # fmt: skip
 SMALL = Config(
     prior=PriorConfig(bank=32, minibatch=32, updates=1, hidden=(16,), score_banks=3),
     amp=AMPConfig(hidden=(16,), updates=4, minibatch=32, replay=400, replay_new=10, optimizer="adam"),
@@ -71,6 +78,24 @@ def rollout_of(points, valid=None):
     points = jnp.asarray(points, jnp.float32)
     valid = jnp.ones((STEPS, COUNT), bool) if valid is None else jnp.asarray(valid)
     return Rollout(points.reshape(STEPS, COUNT, -1), valid, jnp.zeros((STEPS, COUNT), bool))
+
+
+def nominal_traits(robot, count):
+    """Robots that are as their model says."""
+    joints = robot.joint_count
+    ones, none = jnp.ones((count, joints)), jnp.zeros((count, joints))
+    one, zero = jnp.ones((count, 1)), jnp.zeros((count, 1))
+    return Traits(one, zero, jnp.zeros((count, 3)), ones, ones, ones, none, ones, jnp.zeros((count, 2)))
+
+
+def other_traits(robot, count):
+    """Robots that differ in everything, each in its own way."""
+    rng = np.random.default_rng(0)
+    shapes = traits.widths(robot.joint_count)
+    spans = Traits(
+        (0.3, 1.2), (-1, 3), (-0.05, 0.05), (0.8, 1.2), (0.8, 1.2), (0.7, 1), (0.1, 0.2), (1, 1.5), (-0.1, 0.1)
+    )
+    return Traits(*(jnp.asarray(rng.uniform(*s, (count, w)), jnp.float32) for s, w in zip(spans, shapes, strict=True)))
 
 
 def small_policy(robot, walk, **changes):

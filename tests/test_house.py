@@ -1,4 +1,7 @@
-"""Rules of the house that a machine can check: the length of files and functions, spelling, the table of modules."""
+"""Rules of the house that a machine can check.
+
+The length of files and functions, spelling, the table of modules, names that shadow an import, private names, helpers.
+"""
 
 import ast
 import re
@@ -104,3 +107,68 @@ def test_the_table_of_modules_says_what_each_imports():
     listed = {name: words for name, words in said.items() if not re.search("all above|modules below", words)}
     expected = {name: set(re.findall(r"\w+", words)) for name, words in listed.items()}
     assert {name: imported(ROOT / "fmpjax" / name) for name in listed} == expected
+
+
+def nodes(folder: str):
+    """Each file of a folder, and its syntax tree."""
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        yield path.relative_to(ROOT).as_posix(), ast.parse(path.read_text())
+
+
+def shadows(tree: ast.Module) -> list[str]:
+    """Names that a file imports at its top and that one of its functions takes or assigns, in which they mean two."""
+    imports = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+    known = {(name.asname or name.name).split(".")[0] for node in imports for name in node.names}
+    found = set()
+    for function in ast.walk(tree):
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            for node in ast.walk(function):
+                if isinstance(node, ast.arg):
+                    found.add(node.arg)
+                elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                    found.add(node.id)
+    return sorted(found & known)
+
+
+def test_no_name_shadows_an_import():
+    found = {path: shadows(tree) for folder in ("fmpjax", "benchmarks", "examples") for path, tree in nodes(folder)}
+    assert len(found) > 150
+    assert {path: names for path, names in found.items() if names} == {}
+
+
+def test_a_name_that_shadows_an_import_is_found():
+    taken = "from a import metrics, runs as made\nimport b.c\ndef f(metrics):\n    made = b = 1\n    other = 2\n"
+    assert shadows(ast.parse(taken)) == ["b", "made", "metrics"]
+    assert shadows(ast.parse("import metrics\nmetrics = metrics.f\ndef f(): return metrics")) == []
+
+
+def private(tree: ast.Module) -> list[str]:
+    """Names with a leading underscore that a file takes from elsewhere."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            found += [name.name for name in node.names]
+        elif isinstance(node, ast.Attribute) and getattr(node.value, "id", None) not in ("self", "os"):
+            found.append(node.attr)
+    return sorted({name for name in found if re.match(r"_[a-z]", name)} - {"_asdict", "_fields", "_replace"})
+
+
+def test_benchmarks_and_examples_use_nothing_private():
+    found = {path: private(tree) for folder in ("benchmarks", "examples") for path, tree in nodes(folder)}
+    assert len(found) > 10
+    assert {path: names for path, names in found.items() if names} == {}
+
+
+def test_a_private_name_is_found():
+    assert private(ast.parse("from a import _b\nc = d.e._f\nself._g = h._replace(i=1)")) == ["_b", "_f"]
+
+
+def test_helpers_are_not_in_test_files():
+    """What several tests need is in tests/helpers.py."""
+    taken = {
+        f"{path}: {node.module}"
+        for path, tree in nodes("tests")
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and re.search(r"^tests\..*\btest_", node.module or "")
+    }
+    assert taken == set()

@@ -1,6 +1,7 @@
 """What stands beside the package: requirements, Makefile, examples in the documents."""
 
 import doctest
+import importlib
 import os
 import re
 import shutil
@@ -11,7 +12,6 @@ from pathlib import Path
 import pytest
 
 import fmpjax
-from fmpjax import transport
 from tests.helpers import ROOT
 
 IMPORTED_AS = {
@@ -58,8 +58,16 @@ def test_the_oldest_versions_are_those_that_the_project_declares():
         assert pinned == least + ["0"] * (len(pinned) - len(least)), requirement
 
 
-def test_the_examples_of_docstrings_are_right():
-    found = doctest.testmod(transport)
+def _examples():
+    """The modules whose docstrings have examples."""
+    for path in sorted((ROOT / "fmpjax").rglob("*.py")):
+        if re.search(r"^\s*>>> ", path.read_text(), re.MULTILINE):
+            yield ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+@pytest.mark.parametrize("name", _examples())
+def test_the_examples_of_docstrings_are_right(name):
+    found = doctest.testmod(importlib.import_module(name))
     assert found.attempted and not found.failed
 
 
@@ -177,3 +185,47 @@ def test_the_links_of_the_pages_lead_somewhere(page):
         target = page.parent / path if path else page
         assert target.exists(), link
         assert not anchor or target.suffix != ".md" or anchor in _headings(target), link
+
+
+# --- benchmarks/accelerator.sh ---------------------------------------------------------------------------------------
+
+needs_coreutils = pytest.mark.skipif(not (shutil.which("timeout") and shutil.which("split")), reason="no timeout here")
+
+
+def _accelerator(folder: Path, *arguments: object) -> subprocess.CompletedProcess:
+    """The script with an interpreter that says what it is asked for and makes a run's configuration."""
+    python = folder / "python"
+    python.write_text('#!/bin/sh\necho "asked: $*"\n[ "$3" != train ] || echo {} > "$MADE/config.json"\n')
+    python.chmod(0o755)
+    environment = os.environ | {"PYTHON": str(python), "MADE": str(folder / "out" / "run")}
+    command = ["bash", str(ROOT / "benchmarks" / "accelerator.sh"), *map(str, arguments)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+
+
+@needs_coreutils
+def test_an_accelerator_is_measured_and_trained_on_in_pieces(tmp_path):
+    """A step's failure does not end it; the second piece of a training resumes the first."""
+    out = tmp_path / "out"
+    (out / "run").mkdir(parents=True)
+    measured = _accelerator(tmp_path, "measure", out)
+    assert measured.returncode == 0, measured.stderr
+    asked = re.findall(r"^asked: benchmarks/(\w+)\.py", measured.stdout, re.MULTILINE)
+    assert asked == ["physics"] * 6 + ["fit", "throughput"]
+    assert {path.stem for path in out.glob("*.log")} >= {"machine", "physics-mjx-warp-4096", "fit", "parts"}
+    first, second = (_accelerator(tmp_path, "train", out, 30, "--motion", "clip.csv").stdout for _ in range(2))
+    assert f"train --preset paper --reset fixed --method fmp --run {out}/run --motion clip.csv" in first
+    assert f"train --resume --run {out}/run --motion clip.csv" in second
+    assert _accelerator(tmp_path, "train", out).returncode == 2
+
+
+@needs_coreutils
+def test_a_packed_run_has_its_newest_state_and_its_best(tmp_path):
+    out = tmp_path / "out"
+    for name in ("config.json", "best/7/state", "checkpoints/9/state", "checkpoints/10/state"):
+        (out / "run" / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / "run" / name).write_text(name)
+    assert _accelerator(tmp_path, "pack", out).returncode == 0
+    assert _accelerator(tmp_path, "unpack", out / "packed", tmp_path / "there").returncode == 0
+    run = tmp_path / "there" / "run"
+    files = {path.relative_to(run).as_posix() for path in run.rglob("*") if path.is_file()}
+    assert files == {"config.json", "best/7/state", "checkpoints/10/state"}

@@ -172,6 +172,8 @@ def notes(record: Mapping[str, Any]) -> list[str]:
         "Methods are compared on the motions and seeds that all of them have finished.",
         "Figures are interquartile means over motions and seeds (of walks the share), with their 95 % bootstrap "
         "intervals, stratified by motion; the last column counts pairs of the same motion and seed.",
+        "Falls at a size are of starts with joint noise of that deviation; all other figures are of the starts that "
+        "docs/metrics.md calls the headline's.",
     ]
     if len(record["machines"]) != 1:
         found.append(

@@ -120,7 +120,7 @@ def main(
     opened = runs.Run.open(run)
     priors.check_potential(opened.config.method)
     path = out or opened.folder / ("ranking-start.json" if start else "ranking.json")
-    results.check_folder(path.parent)
+    results.check_file(path)
     if start:
         trainer = opened.trainer()
         policy = trainer.init().ppo

@@ -6,10 +6,8 @@ the few updates of a rollout follow the transport they are fitted to, and which 
 ``fmpjax experiment standing measure --out FOLDER``; ``look --run RUN`` looks at a run's newest state only.
 """
 
-import csv
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -258,13 +256,6 @@ def examine(trainer: Trainer, state: TrainState, seed: int) -> dict[str, float]:
     return row | behaviors(moments) | {name: float(value) for name, value in rest.items()}
 
 
-def _write(path: Path, rows: Sequence[Mapping[str, float | str]]) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows({k: v if isinstance(v, str) else f"{v:.6g}" for k, v in row.items()} for row in rows)
-
-
 def look(run: tuple[Path, ...], out: Path) -> None:
     """Look at the newest state of runs.
 
@@ -272,6 +263,7 @@ def look(run: tuple[Path, ...], out: Path) -> None:
       run: one folder or several.
       out: CSV file to write, a line a run.
     """
+    results.check_file(out)
     rows = []
     for folder in run:
         opened = runs.Run.open(folder)
@@ -281,8 +273,7 @@ def look(run: tuple[Path, ...], out: Path) -> None:
         row = examine(trainer, state, trainer.config.seed)
         rows.append({"run": f"{folder.parent.name}/{folder.name}"} | row)
         print("\n".join(f"  {name:<32} {value:.4g}" for name, value in row.items()), flush=True)
-    _write(out, rows)
-    print(f"wrote {out}")
+    print(f"wrote {results.write_csv(out, rows)}")
 
 
 def track(trainer: Trainer) -> dict[str, float | str]:
@@ -345,6 +336,8 @@ def measure(
     """
     changes = dict(item.partition("=")[::2] for item in set)
     config: Config = preset(preset_name, motion=motion, frames=frames, seed=seed, transitions=transitions, **changes)
+    priors.check_potential(config.method)
+    results.check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(config, runs.load_motion(config))
     tracking = track(trainer)
@@ -372,7 +365,7 @@ def measure(
             f"{time.monotonic() - began:.0f} s",
             flush=True,
         )
-        _write(out / "standing.csv", rows)
+        results.write_csv(out / "standing.csv", rows)
     settings = {"preset": preset_name, "motion": Path(motion).name, "frames": frames, "seed": seed, "set": changes}
     evaluation = Evaluator(trainer)(state.ppo).record()
     record = {"settings": settings, "tracking": tracking, "evaluation": evaluation, "provenance": runs.provenance()}

@@ -10,8 +10,8 @@ import mujoco
 from fmpjax import machine
 from fmpjax.config import PhysicsConfig
 from fmpjax.errors import UserError
+from fmpjax.physics import native
 from fmpjax.physics.base import PhysicsState
-from fmpjax.physics.native import model
 from fmpjax.physics.traits import Nominal, Traits, changed, unpacked
 from fmpjax.robots import Robot
 
@@ -31,7 +31,7 @@ class MjxPhysics:
         if robot.self_collision and config.impl == "jax":
             # MJX in JAX works on every pair of geoms at every step: of a pair of shapes' kinds the nearest are kept.
             limits = {"max_geom_pairs": config.max_contacts, "max_contact_points": config.max_contacts}
-        self.model = model(robot, config, **limits)
+        self.model = native.model(robot, config, **limits)
         self._device = jax.local_devices()[0]  # of several processes each has its own
         self._overflow = 0  # bits of Warp's word on worlds that lost contacts or constraints to a full buffer
         if config.impl == "warp":

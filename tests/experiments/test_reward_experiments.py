@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import re
 from types import SimpleNamespace
 
@@ -13,11 +14,11 @@ import pytest
 from fmpjax import cli, potential, priors, runs, transport
 from fmpjax.config import Config, PriorConfig
 from fmpjax.errors import UserError
-from fmpjax.experiments import barycenter, curvature, generalization, report, static_teacher
+from fmpjax.experiments import barycenter, curvature, generalization, ranking, report, standing, static_teacher
 from fmpjax.experiments.common import histories, offline, reference, results, table
 from fmpjax.priors import flow
 from fmpjax.trainer import Trainer
-from tests.helpers import tiny
+from tests.helpers import PROVENANCE, tiny
 
 SMALL = PriorConfig(bank=16, minibatch=16, hidden=(8,))
 
@@ -275,6 +276,23 @@ def test_run_without_a_policy(refused, tmp_path):
 def test_place_that_cannot_be_written(refused, tmp_path):
     (tmp_path / "file").write_text("")
     assert "--out file/out cannot be written" in refused(curvature.main, "--out", "file/out")
+    assert "--out file cannot be written" in refused(standing.COMMANDS, "measure", "--out", "file")
+    look = ("look", "--run", "run", "--out")
+    assert "--out file cannot be written" in refused(standing.COMMANDS, *look, "file/look.csv")
+    (tmp_path / "folder").mkdir()
+    assert "--out folder is a folder: expected a file" in refused(standing.COMMANDS, *look, "folder")
+    runs.Run.create(tmp_path / "run", tiny())
+    assert "--out folder is a folder" in refused(ranking.main, "--run", "run", "--out", "folder")
+
+
+def test_a_study_of_a_potential_wants_one(refused):
+    measure = ("measure", "--out", "out", "--set", "method=amp")
+    assert "method is 'amp': expected one that fits a potential" in refused(standing.COMMANDS, *measure)
+
+
+def test_a_table_is_written_into_a_new_folder_with_whole_numbers_and_blanks(tmp_path):
+    path = results.write_csv(tmp_path / "new" / "a.csv", [{"n": 12_345_678, "x": 1 / 3}, {"n": 1, "x": math.nan}])
+    assert path.read_text().split() == ["n,x", "12345678,0.333333", "1,"]
 
 
 @pytest.mark.parametrize(
@@ -334,12 +352,6 @@ def test_a_study_from_run_folders_to_its_files(tmp_path, capsys):
 
 
 # --- the report ------------------------------------------------------------------------------------------------------
-
-
-PROVENANCE = {
-    "command": "python -m fmpjax.experiments.x", "date": "2026-01-01", "commit": "0123456789abcdef",
-    "device": "2 CPU cores", "packages": {"jax": "0.10"}, "uncommitted_changes": False,
-}  # fmt: skip
 
 
 def static_record(dynamic=0.3, static=0.4):

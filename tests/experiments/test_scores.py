@@ -17,6 +17,7 @@ from fmpjax.experiments.common import comparison, explorer, scores, statistics
 from fmpjax.experiments.common.scores import History, Result
 from fmpjax.experiments.common.statistics import Estimate
 from fmpjax.experiments.common.table import Row
+from tests.helpers import PROVENANCE
 
 GOOD = {
     "quality": 0.9, "falls": 0.0, "late_speed": 0.9, "path_speed": 0.5, "demonstration_speed": 1.0,
@@ -47,6 +48,21 @@ def test_scores_of_an_evaluation():
     assert (found["foot_slip"], found["action_rate"], found["joint_jerk"], found["power"]) == (0.1, 3.0, 900.0, 80.0)
     # Where the demonstration turns, the pace is along the own heading.
     assert scores.scores(row(demonstration_turning=0.5), 30.0)["pace_error"] == pytest.approx(0.5)
+
+
+def test_falls_stand_at_every_size_of_noise():
+    """Also of records that have none, as earlier versions wrote them."""
+    figures = {"falls_at_0": 0.0, "falls_at_0.001": 2.0, "falls_at_0.01": 40.0}
+    assert figures.items() <= scores.scores(row(**figures), 30.0).items()
+    assert math.isnan(scores.scores(row(), 30.0)["falls_at_0.01"])
+    found = record([result(method, seed, 0.5, **figures) for method in ("fmp", "amp") for seed in (0, 1)])
+    headings = comparison.table(found).headings
+    place = headings.index("at 0.01 rad, %")
+    assert headings[place - 3 : place] == ["falls, %", "at 0 rad, %", "at 0.001 rad, %"]
+    assert comparison.table(found).lines[0][place].startswith("40.0 (")
+    found["scores"] = [line for line in found["scores"] if not line["score"].startswith("falls_at")]
+    assert comparison.table(found).lines[0][place] == "–"
+    assert any("joint noise" in note for note in found["notes"])
 
 
 def test_who_falls_early_scores_as_one_who_holds_still():
@@ -295,7 +311,6 @@ def test_the_script_sorts_and_filters(tmp_path):
 
 def test_the_report_holds_the_benchmark(tmp_path):
     from fmpjax.experiments import report
-    from tests.experiments.test_reward_experiments import PROVENANCE
 
     results = [
         result(m, s, q, budget=b) for m, q in (("fmp", 0.5), ("amp", 0.6)) for s in (0, 1) for b in scores.BUDGETS

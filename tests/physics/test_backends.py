@@ -13,7 +13,7 @@ from fmpjax import physics, robots
 from fmpjax.config import PhysicsConfig, preset
 from fmpjax.errors import UserError
 from fmpjax.physics import ffi, native
-from tests.physics.test_traits import nominal, other
+from tests.helpers import nominal_traits, other_traits
 
 PAPER = PhysicsConfig(backend="native")
 LAPTOP = dataclasses.replace(preset("laptop").physics, backend="native")
@@ -195,7 +195,10 @@ def test_mjx_steps_like_native(robot, states):
     targets[8:] += 0.3 * np.sign(targets[8:] - qpos[8:, 7:])  # so far that servos reach their force limits
     stiffness, effort = physics.native.model(robot, LAPTOP).actuator_gainprm[:, 0], robot.effort
     assert (np.abs(stiffness * (targets[8:] - qpos[8:, 7:])) > effort).any()
-    plain, own = nominal(robot, 8), other(robot, 3)._replace(joint_friction=nominal(robot, 3).joint_friction)
+    plain, own = (
+        nominal_traits(robot, 8),
+        other_traits(robot, 3)._replace(joint_friction=nominal_traits(robot, 3).joint_friction),
+    )
     traits = jax.tree.map(lambda *x: jnp.concatenate(x), plain, own)
     several = np.stack([targets, targets + 0.1], axis=1)  # of each physics step, as delays make them
     config = dataclasses.replace(LAPTOP, iterations=10, ls_iterations=20)

@@ -13,26 +13,10 @@ from fmpjax.config import preset
 from fmpjax.errors import UserError
 from fmpjax.physics import native, traits
 from fmpjax.physics.traits import Traits
+from tests.helpers import nominal_traits, other_traits
 
 LAPTOP = dataclasses.replace(preset("laptop").physics, backend="native")
 COUNT = 4
-
-
-def nominal(robot, count=COUNT):
-    joints = robot.joint_count
-    ones, none = jnp.ones((count, joints)), jnp.zeros((count, joints))
-    one, zero = jnp.ones((count, 1)), jnp.zeros((count, 1))
-    return Traits(one, zero, jnp.zeros((count, 3)), ones, ones, ones, none, ones, jnp.zeros((count, 2)))
-
-
-def other(robot, count=COUNT):
-    """Robots that differ in everything, each in its own way."""
-    rng = np.random.default_rng(0)
-    shapes = traits.widths(robot.joint_count)
-    spans = Traits(
-        (0.3, 1.2), (-1, 3), (-0.05, 0.05), (0.8, 1.2), (0.8, 1.2), (0.7, 1), (0.1, 0.2), (1, 1.5), (-0.1, 0.1)
-    )
-    return Traits(*(jnp.asarray(rng.uniform(*s, (count, w)), jnp.float32) for s, w in zip(spans, shapes, strict=True)))
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +62,12 @@ def by_hand(robot, config, state, targets, own: Traits):
 def test_a_trait_is_what_mujoco_makes_of_a_changed_model(robot, states, name):
     qpos, qvel, targets = states
     backend = physics.make(robot, LAPTOP)
-    plain = nominal(robot)
-    own = other(robot) if name == "all" else plain._replace(**{name: getattr(other(robot), name)})
+    plain = nominal_traits(robot, COUNT)
+    own = (
+        other_traits(robot, COUNT)
+        if name == "all"
+        else plain._replace(**{name: getattr(other_traits(robot, COUNT), name)})
+    )
     start = physics.reset(qpos, qvel)
     after = jax.jit(backend.step)(start, targets, own)
     before = jax.jit(backend.step)(start, targets)
@@ -96,7 +84,7 @@ def test_the_models_own_traits_change_no_bit(robot, states):
     backend, start = physics.make(robot, LAPTOP), physics.reset(qpos, qvel)
     plain = jax.jit(backend.step)(start, targets)
     for held in (targets, jnp.repeat(targets[:, None], LAPTOP.substeps, axis=1)):
-        own = jax.jit(backend.step)(start, held, nominal(robot))
+        own = jax.jit(backend.step)(start, held, nominal_traits(robot, COUNT))
         for a, b in zip(plain, own, strict=True):
             np.testing.assert_array_equal(a, b)
 
@@ -106,7 +94,7 @@ def test_targets_of_each_physics_step(robot, states):
     backend = physics.make(robot, LAPTOP)
     several = jnp.stack([targets, targets + 0.2], axis=1)
     after = jax.jit(backend.step)(physics.reset(qpos, qvel), several)
-    own = Traits(*(np.asarray(x)[0] for x in nominal(robot)))
+    own = Traits(*(np.asarray(x)[0] for x in nominal_traits(robot, COUNT)))
     for i in range(COUNT):
         found = by_hand(robot, LAPTOP, (qpos[i], qvel[i]), several[i], own)
         np.testing.assert_allclose(after.qvel[i], found[1], rtol=1e-4, atol=1e-4)
@@ -114,7 +102,7 @@ def test_targets_of_each_physics_step(robot, states):
 
 def test_traits_of_batches_of_batches(robot, states):
     qpos, qvel, targets = states
-    backend, own = physics.make(robot, LAPTOP), other(robot)
+    backend, own = physics.make(robot, LAPTOP), other_traits(robot, COUNT)
     start = physics.reset(qpos, qvel)
     together = jax.jit(backend.step)(start, targets, own)
     pairs = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), (start, targets, own))

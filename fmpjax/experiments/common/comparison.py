@@ -23,6 +23,8 @@ POINTS = 41  # of a profile
 LEAST_SEEDS = 5  # of every motion, from which on one method is said to be better than another
 _EQUAL = {"transitions": "equal transitions", "seconds": "equal wall time"}
 
+_NOTHING = dict.fromkeys(Estimate._fields)
+
 Group = Mapping[str, Mapping[tuple[str, int], Result]]  # by method, and by motion and seed
 
 
@@ -99,7 +101,8 @@ def table(record: Mapping[str, Any]) -> Table:
     headings.append(f"better than {title(reference)}, %")
     lines = []
     for reset, budget, method in dict.fromkeys((s["reset"], s["budget"], s["method"]) for s in record["scores"]):
-        cells = [scores[reset, budget, method, score.name] for score in SCORES]
+        # A record of an earlier version has fewer scores.
+        cells = [scores.get((reset, budget, method, score.name), _NOTHING) for score in SCORES]
         against = better.get((reset, budget, method))
         lines.append(
             [

@@ -53,6 +53,13 @@ def check_folder(out: Path) -> None:
         raise UserError(f"--out {out} cannot be written: expected a folder, or a place where one can be made")
 
 
+def check_file(out: Path) -> None:
+    """Raise a `UserError` unless ``out`` can be a file in a folder that can be written, or can be made one."""
+    if out.is_dir():
+        raise UserError(f"--out {out} is a folder: expected a file to write")
+    check_folder(out.parent)
+
+
 def save(
     out: Path, name: str, record: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], places: Iterable[Path | str]
 ) -> list[Path]:
@@ -68,13 +75,19 @@ def save(
     out.mkdir(parents=True, exist_ok=True)
     written = jsons.dumps({"provenance": runs.provenance(), **record})
     runs.write(out / f"{name}.json", runs.without_places(written, places))
-    partial = out / f"{name}.csv.partial"
+    return [out / f"{name}.json", write_csv(out / f"{name}.csv", rows)]
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
+    """Write ``rows`` whole or not at all, into a folder that is made if need be; the path written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.name}.partial")
     with partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
         writer.writeheader()
         writer.writerows({k: _cell(v) for k, v in row.items()} for row in rows)
-    partial.replace(out / f"{name}.csv")
-    return [out / f"{name}.json", out / f"{name}.csv"]
+    partial.replace(path)
+    return path
 
 
 def _cell(value: Any) -> Any:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fmpjax.config import Config
 from fmpjax.evaluate import pace_error
 from fmpjax.experiments.common import table
 from fmpjax.experiments.common.cells import Cell
@@ -28,10 +29,12 @@ class Score(NamedTuple):
     better: int  # 1 where more is better, -1 where less is
 
 
+_SIZED = {f"falls_at_{size:g}": size for size in Config().evaluation_noise}  # rad, of the starts
 SCORES = (
     Score("quality", "quality", 3, 1),
     Score("walks", "walks, %", 0, 1),
     Score("falls", "falls, %", 1, -1),
+    *(Score(name, f"at {size:g} rad, %", 1, -1) for name, size in _SIZED.items()),
     Score("pace_error", "pace error", 3, -1),
     Score("excursion_error", "excursion error", 3, -1),
     Score("amplitude_error", "amp. error, °", 2, -1),
@@ -106,6 +109,7 @@ def scores(row: Row, still: float) -> dict[str, float]:
         "quality": row.figure("quality"),
         "walks": 100.0 * walks(row),
         "falls": row.figure("falls"),
+        **{name: row.figure(name) for name in _SIZED},
         "pace_error": pace_error(row.figures),
         "excursion_error": 1.0 if math.isnan(excursion) else abs(excursion - 1.0),
         "amplitude_error": still if math.isnan(amplitude) else amplitude,

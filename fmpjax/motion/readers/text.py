@@ -54,7 +54,7 @@ def read(file: Path, robot: Robot, options: Options) -> Recording:
     place, turn, order, joints, time, left = _layout(file, names, rows.shape[1], robot, options)
     rate, rate_from = _rate(file, rows, time)
     kind = Fact("format", "text", f"{rows.shape[1]} columns, {'a header' if header else 'no header'}")
-    warnings = (f"columns left out: {', '.join(left[:6])}{' ...' if len(left) > 6 else ''}",) if left else ()
+    left_out = (f"columns left out: {', '.join(left[:6])}{' ...' if len(left) > 6 else ''}",) if left else ()
     return assemble(
         file,
         robot,
@@ -70,7 +70,7 @@ def read(file: Path, robot: Robot, options: Options) -> Recording:
         name="line",
         first=1 + first,
         order_from="the header's names" if order == "wxyz" else "the format's",
-        warnings=warnings,
+        warnings=left_out,
     )
 
 
