@@ -12,6 +12,7 @@ import tyro
 from fmpjax import motion, robots
 from fmpjax.errors import UserError
 from fmpjax.motion import MotionClip, gait
+from fmpjax.motion.clip import Fact
 from fmpjax.motion.gait import Style
 from fmpjax.shell import Group, default
 
@@ -58,7 +59,11 @@ class Source(Reading):
         if len(recording.qpos) < formats.LEAST_SAMPLES:
             raise UserError(f"{file}: {len(recording.qpos)} frames, expected at least {formats.LEAST_SAMPLES}")
         clip = MotionClip.from_qpos(file.stem, robots.load(self.robot).name, recording.rate, recording.qpos)
-        clip = dataclasses.replace(clip, reading=recording.reading)
+        reading = recording.reading
+        if recording.loops and self.frames is None:
+            why = f"the file says that it loops; import and train repeat it to {formats.LOOPED:g} s"
+            reading = reading._replace(facts=(*reading.facts, Fact("loop", "shown once", why)))
+        clip = dataclasses.replace(clip, reading=reading)
         return clip, check.flips(recording.qpos[:, 3:7])
 
 
@@ -105,6 +110,8 @@ class Import(Reading):
         for file in self.files:
             clip = motion.load(file, rate=self.rate, **options)
             said.append(f"{file} was read as\n{clip.reading}")
+            if (doubt := check.doubtful_rate(robot, clip)) is not None:  # the written file will have a rate
+                said.append(f"  warning: {doubt}")
             if self.speed != 1:
                 before, clip = clip, edit.faster(clip, self.speed)
                 said.append(f"  {_torques(robot, before, clip)}")

@@ -190,18 +190,21 @@ def unsuited(robot: Robot, clip: MotionClip, *, axes: str, reset: str, seconds: 
             f"the motion lasts {clip.duration:.1f} s and does not loop, and an evaluation lasts {seconds:g} s: "
             "it does not say what the policy should do after that"
         )
-    if _assumed_rate(clip):
-        ratio, stride = pace(robot, clip)
-        if not SLOW < ratio < FAST:
-            said.append(
-                f"strides of {stride:.2f} m are usually {'faster' if ratio < 1 else 'slower'}, and the file has no "
-                "rate: check it, and give it by --fps"
-            )
-    return said
+    doubt = doubtful_rate(robot, clip)
+    return said if doubt is None else [*said, doubt]
 
 
-def _assumed_rate(clip: MotionClip) -> bool:
-    return any(fact.what == "rate" and fact.why.startswith("assumed") for fact in clip.reading.facts)
+def doubtful_rate(robot: Robot, clip: MotionClip) -> str | None:
+    """A sentence where the file has no rate and the strides suggest another one than was assumed."""
+    if not any(fact.what == "rate" and fact.why.startswith("assumed") for fact in clip.reading.facts):
+        return None
+    ratio, stride = pace(robot, clip)
+    if SLOW < ratio < FAST:
+        return None
+    return (
+        f"strides of {stride:.2f} m are usually {'faster' if ratio < 1 else 'slower'}, and the file has no "
+        "rate: check it, and give it by --fps"
+    )
 
 
 def pace(robot: Robot, clip: MotionClip) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import pickle
 import re
 import time
 
@@ -333,6 +334,27 @@ def test_import_check_and_synthesize(tmp_path, capsys, robot):
     torque = re.search(r"torque +(\S+) of (\w+)'s limit, (\S+) of (\w+)'s at the file's speed", said)
     fast, slow = (figures(robot, motion.load(path))["torque"] for path in (tmp_path / "fast.npz", "walk"))
     assert torque.groups() == (f"{fast.value:.2f}", fast.where, f"{slow.value:.2f}", slow.where)
+
+
+def test_import_doubts_an_assumed_rate(robot, tmp_path, capsys):
+    """The written file has a rate, so nothing could tell later."""
+    rows = motion.load("walk", rate=60.0).qpos[:, [0, 1, 2, 4, 5, 6, 3, *range(7, 7 + robot.joint_count)]]
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", fmt="%.6f")
+    run("import", tmp_path / "a.csv", "--out", tmp_path / "b.npz")
+    assert "strides of 0.93 m are usually faster" in capsys.readouterr().out
+    run("import", tmp_path / "a.csv", "--fps", "60", "--out", tmp_path / "b.npz")
+    assert "strides" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["check", "segment"])
+def test_what_shows_a_loop_once_says_that_it_loops(robot, walk, tmp_path, capsys, command):
+    stride = walk.qpos[:55]
+    frames = np.concatenate([stride[:, :3], rotations.log_map(stride[:, 3:7]), stride[:, 7:]], axis=1)
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps({"fps": 50, "loop_mode": 1, "frames": frames.tolist()}))
+    run(command, tmp_path / "a.pkl")
+    assert "the file says that it loops; import and train repeat it to 10 s" in capsys.readouterr().out
+    run(command, tmp_path / "a.pkl", "--frames", "0:40")
+    assert "repeat it" not in capsys.readouterr().out
 
 
 def test_broken_clip_is_exit_code_one_until_it_is_fixed(tmp_path, capsys, walk):

@@ -12,6 +12,7 @@ import numpy as np
 from fmpjax import rotations
 from fmpjax.errors import UserError
 from fmpjax.motion.clip import Fact, Reading
+from fmpjax.motion.soles import slides, sole_points
 from fmpjax.robots import Robot
 
 MOST_SAMPLES = 10_000_000
@@ -19,9 +20,13 @@ MOST_SAMPLES = 10_000_000
 NORM_TOLERANCE = 0.05
 GREATEST = 1e6  # m or rad; more is another column, or damage
 ORDERS = ("wxyz", "xyzw")
+ASSUMED = "the format's"  # where a quaternion's order comes from, if nothing in the file says it
 # Sets of words for `Options.without` that other programs' files with fewer joints need.
 WITHOUT = (("wrist",), ("waist_roll", "waist_pitch", "wrist_pitch", "wrist_yaw"))
-TILTED, UPRIGHT = 0.5, 0.7  # cosine of a root's tilt: a doubtful mean, and the least of one that stands
+TILTED, UPRIGHT = 0.94, 0.7  # cosine of a root's tilt: a doubtful mean, and that of one that stands
+PLAINLY = 2.0  # times less tilt or slip, by which the other order of the quaternion is the better one
+SLIPS = 0.3  # m/s over the floor, of the lowest sole point, from which a walk is doubtful
+STEPS = 300  # pairs of rows in which the soles are looked at
 LIMIT_SLACK = 0.2  # rad that a file may exceed a joint's limit by and still be in radians
 LISTED = 4  # joints that a sentence names
 
@@ -113,7 +118,7 @@ def assemble(
     name: str,
     first: int = 0,
     warnings: Sequence[str] = (),
-    order_from: str = "the format's",
+    order_from: str = ASSUMED,
     robot_from: str = "assumed, the file names none; --robot replaces it",
     loops: bool = False,
 ) -> Recording:
@@ -146,6 +151,8 @@ def assemble(
         _check_radians(file, angles, robot)
     if options.fps is not None:
         rate, rate_from = float(options.fps), "--fps"
+    if (quaternion.value, quaternion.why) == ("xyzw", ASSUMED):
+        _check_soles(file, robot, position, rotation, angles, rate)
     facts.append(Fact("rate", f"{rate:g} Hz", rate_from))
     return Recording(
         np.concatenate([position, rotation_wxyz, angles], axis=1),
@@ -283,12 +290,37 @@ def oriented(
             f"{file}: the root's z axis points down in all rows, expected a standing robot; "
             "if this is meant, give `fmpjax motion import` --quaternion wxyz or xyzw"
         )
-    if usual.mean() < TILTED and swapped.min() > UPRIGHT:
+    if usual.mean() < TILTED and swapped.mean() > UPRIGHT and 1 - usual.mean() > PLAINLY * (1 - swapped.mean()):
+        tilts = [np.degrees(np.arccos(np.clip(up, -1, 1))).mean() for up in (usual, swapped)]
         raise UserError(
-            f"{file}: as {order}, the format's order, the root lies on its side, and as {other} it stands; "
-            "say which: `fmpjax motion import --quaternion wxyz` or xyzw"
+            f"{file}: as {order}, the format's order, the root is tilted by {tilts[0]:.0f}° on average, and as {other} "
+            f"by {tilts[1]:.0f}°; say which: `fmpjax motion import --quaternion wxyz` or xyzw"
         )
     return read[order], Fact("quaternion", order, order_from)
+
+
+def _check_soles(file: Path, robot: Robot, position, xyzw: np.ndarray, angles: np.ndarray, rate: float) -> None:
+    """Refuse quaternions ``[T, 4]`` in place of which wxyz lets the feet slide much less.
+
+    A root that looks along -x is upright in both orders. In the wrong one it looks along +x, and walks backward. Only
+    files that are read as xyzw are in doubt: MuJoCo's order is often written where others expect theirs.
+    """
+    if len(xyzw) < 2 or rotations.up(xyzw).min() <= UPRIGHT:
+        return
+    first = np.unique(np.linspace(0, len(xyzw) - 2, STEPS).astype(int))
+    rows = np.stack([first, first + 1], axis=1).ravel()
+    speeds = []
+    for wxyz in (xyzw[rows][:, [3, 0, 1, 2]], xyzw[rows]):
+        points, turned = sole_points(robot, np.concatenate([position[rows], wxyz, angles[rows]], axis=1))
+        height = points[..., 2] - robot.sole_radius
+        lowest = np.argmin(height[::2] + height[1::2], axis=1)
+        slid = slides(robot, points, turned)[::2]  # within the pairs, not between them
+        speeds.append(float(slid[np.arange(len(slid)), lowest].mean() * rate))
+    if speeds[0] > SLIPS and speeds[0] > PLAINLY * speeds[1]:
+        raise UserError(
+            f"{file}: as xyzw, the format's order, the feet slide over the floor at {speeds[0]:.2g} m/s, and as wxyz "
+            f"at {speeds[1]:.2g} m/s; say which: `fmpjax motion import --quaternion wxyz` or xyzw"
+        )
 
 
 def _check_radians(file: Path, angles: np.ndarray, robot: Robot) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from fmpjax.errors import UserError
 from fmpjax.motion.clip import Fact
 from fmpjax.motion.readers.recording import (
+    ASSUMED,
     Columns,
     Options,
     Recording,
@@ -69,7 +70,7 @@ def read(file: Path, robot: Robot, options: Options) -> Recording:
         rate_from=rate_from,
         name="line",
         first=1 + first,
-        order_from="the header's names" if order == "wxyz" else "the format's",
+        order_from="the header's names" if order == "wxyz" else ASSUMED,
         warnings=left_out,
     )
 

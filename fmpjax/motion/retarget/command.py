@@ -1,5 +1,6 @@
 """What `fmpjax motion retarget` does: a file in, a clip and a report out."""
 
+import dataclasses
 import os
 from pathlib import Path
 
@@ -87,7 +88,8 @@ def convert(
     if first == 0 and last > 1 and odd_start(source):
         first = 1
         said.append("frame 0 is another pose, and is left out")
-    done = retarget(source, robot, file.stem, span=(first, last), skeleton=names, up=up)
+    done = retarget(source, robot, str(file), span=(first, last), skeleton=names, up=up)
+    done = done._replace(clip=dataclasses.replace(done.clip, name=file.stem))
     save(done.clip, out)
     facts = [*done.clip.reading.facts, Fact("frames", f"{first} to {last}", "as asked" if frames else "all")]
     verdict, faults = done.verdict(robot)

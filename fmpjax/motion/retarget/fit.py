@@ -98,7 +98,7 @@ def retarget(
     thinned = f", one frame of {every}" if every > 1 else ""
     facts = (
         Fact("format", source.format, f"{len(source.names)} joints, {len(source.values)} frames"),
-        Fact("robot", robot.name, "as asked"),
+        Fact("robot", robot.name, "--robot replaces it"),
         _skeleton_fact(source, joint, told=bool(skeleton)),
         Fact("up", axis, "--up" if up else "hips are over ankles along it"),
         Fact("size", f"{scale:.4g} m per unit", "legs as long as the robot's"),

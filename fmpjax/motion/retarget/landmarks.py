@@ -51,7 +51,7 @@ def read_skeleton(path: str | os.PathLike) -> dict[str, str]:
 
 
 def joints(source: Capture, name: str, skeleton: dict[str, str] | None = None) -> dict[str, int]:
-    """Indices of the skeleton's joints by the part of the body.
+    """Indices of the skeleton's joints by the part of the body; an unknown toe is the end of the ankle's joint.
 
     Raises:
       UserError: a part has no joint whose name is known, or ``skeleton`` names a joint that there is not.
@@ -66,6 +66,7 @@ def joints(source: Capture, name: str, skeleton: dict[str, str] | None = None) -
                 f"{name}: the skeleton has no joint {joint[:40]!r} for {part}, expected one of {_listed(source)}"
             )
         found[part] = source.names.index(joint)
+    missing = []
     for side, (part, names) in itertools.product(SIDES, JOINT_NAMES.items()):
         if f"{side}_{part}" in found:
             continue
@@ -75,13 +76,20 @@ def joints(source: Capture, name: str, skeleton: dict[str, str] | None = None) -
             for joint in (side + other, side[0] + other, f"{other}{side}", f"{other}{side[0]}", *_end(other, side))
         ]
         match = [index[joint] for joint in known if joint in index and index[joint] not in found.values()]
-        if not match:
-            raise UserError(
-                f"{name}: the skeleton has no joint for the {side} {part}, expected one named "
-                f"{side.title()}{names[0]} or the like; name it in a file for --skeleton, with lines such as "
-                f'{side}_{part} = "{source.names[-1][:40]}", from {_listed(source)}'
-            )
-        found[f"{side}_{part}"] = match[0]
+        if not match and part == "toe" and f"{side}_ankle" in found:
+            end = f"{source.names[found[f'{side}_ankle']]} end"
+            match = [source.names.index(end)] if end in source.names else []
+        if match:
+            found[f"{side}_{part}"] = match[0]
+        else:
+            missing.append((side, part, f"{side.title()}{names[0]}"))
+    if missing:
+        side, part, usual = missing[0]
+        raise UserError(
+            f"{name}: the skeleton has no joint for the {', '.join(f'{side} {part}' for side, part, _ in missing)}, "
+            f"expected names such as {usual}; name each in a file for --skeleton, with lines such as "
+            f'{side}_{part} = "NAME", from {_listed(source)}'
+        )
     found.setdefault("pelvis", _fork(source.parent, found["left_hip"], found["right_hip"]))
     found.setdefault("chest", _fork(source.parent, found["left_shoulder"], found["right_shoulder"]))
     return found

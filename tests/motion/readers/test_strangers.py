@@ -15,7 +15,7 @@ import pytest
 
 from fmpjax import cli, motion, robots, rotations
 from fmpjax.errors import UserError
-from fmpjax.motion import formats
+from fmpjax.motion import edit, formats
 from fmpjax.motion.readers import bodies as bodies_reader
 from fmpjax.motion.readers import pickled
 from fmpjax.motion.readers import text as text_reader
@@ -91,7 +91,26 @@ def test_a_root_on_its_side_that_stands_in_the_other_order_is_refused(tmp_path, 
     """A heading of 100 degrees, written wxyz: as xyzw it is a roll of 80 degrees and not upside down."""
     turned = qpos.copy()
     turned[:, 3:7] = rotations.exp_map(np.array([0.0, 0.0, np.radians(100)]))
-    refused(text(tmp_path / "a.csv", turned, order="wxyz"), "lies on its side", "--quaternion wxyz")
+    refused(text(tmp_path / "a.csv", turned, order="wxyz"), "is tilted by 80°", "as wxyz by 0°", "--quaternion wxyz")
+
+
+@pytest.mark.parametrize(("heading", "words"), [(180, "slide over the floor at"), (200, "tilted"), (150, "tilted")])
+def test_a_walk_that_looks_back_is_upright_in_both_orders_and_refused(tmp_path, heading, words):
+    """Written wxyz, it is upright as xyzw too, but looks along +x and walks backward, or leans."""
+    walk = edit.headed(motion.load("walk"), np.radians(heading)).qpos
+    path = text(tmp_path / "a.csv", walk, order="wxyz")
+    refused(path, words, "--quaternion wxyz")
+    same(motion.load(path, fps=RATE, rate=RATE, quaternion="wxyz"), walk)
+    same(motion.load(text(tmp_path / "b.csv", walk), fps=RATE, rate=RATE), walk)
+
+
+def test_a_fall_does_not_hide_the_order(tmp_path):
+    """A walk in a circle, written wxyz, that lies in a fifth of its rows."""
+    walk = motion.load("turn_left").qpos.copy()
+    down = slice(0, len(walk) // 5)
+    walk[down, 3:7] = rotations.multiply(walk[down, 3:7], rotations.exp_map(np.array([0.0, np.pi / 2, 0.0])))
+    refused(text(tmp_path / "a.csv", walk, order="wxyz"), "tilted", "--quaternion wxyz")
+    same(motion.load(text(tmp_path / "b.csv", walk), fps=RATE, rate=RATE), walk)
 
 
 def test_degrees_are_refused_with_the_option_that_reads_them(tmp_path, qpos):

@@ -333,7 +333,12 @@ def test_a_skeleton_file_names_the_joints(robot, second, tmp_path, capsys):
 
     assert code() == 2
     error = capsys.readouterr().err
-    assert "no joint for the left knee" in error and "--skeleton" in error and "Knie" in error
+    assert (
+        error.startswith(f"fmpjax: {path}: ")
+        and "no joint for the left knee" in error
+        and "--skeleton" in error
+        and "Knie" in error
+    )
     for text, word in (
         ('left_knee = "Knee"', "no joint 'Knee' for left_knee"),
         ('left_nose = "Knie"', "'left_nose' is no part"),
@@ -350,6 +355,23 @@ def test_a_skeleton_file_names_the_joints(robot, second, tmp_path, capsys):
     assert len(motion.load(out, rate=30.0)) == 31
 
 
+def test_all_unknown_joints_are_named_at_once_and_an_ankles_end_is_the_toe(source):
+    """None of the names is known; the toes are end sites, which BVH names after their parents."""
+
+    def plain(name):
+        return f"{plain(name.replace('Toe', 'Foot'))} end" if "Toe" in name else f"J{source.names.index(name)}"
+
+    strange = source._replace(names=tuple(map(plain, source.names)))
+    with pytest.raises(UserError, match="no joint for the left hip, left knee, left ankle, left toe, left shoulder,"):
+        retarget.joints(strange, "walk")
+    expected = retarget.joints(source, "walk")
+    told = {part: strange.names[at] for part, at in expected.items() if "toe" not in part}
+    assert retarget.joints(strange, "walk", told) == expected
+    del told["left_hip"], told["right_wrist"]
+    with pytest.raises(UserError, match='the left hip, right wrist, expected .* such as left_hip = "NAME", from J0'):
+        retarget.joints(strange, "walk", told)
+
+
 @pytest.mark.parametrize("name", ["cmu_01_01_first120.bvh", "hip_knee_ankle_names_30.bvh"])
 def test_strangers_captures(external, robot, name, tmp_path, capsys):
     pytest.importorskip("mink")
@@ -363,7 +385,7 @@ def test_strangers_captures(external, robot, name, tmp_path, capsys):
 
 
 def test_faults(robot, source, monkeypatch):
-    with pytest.raises(UserError, match="walk: the skeleton has no joint for the left knee, expected one named"):
+    with pytest.raises(UserError, match="walk: the skeleton has no joint for the left knee, expected names such as"):
         names = tuple(name.replace("LeftLeg", "Knie") for name in source.names)
         retarget.retarget(source._replace(names=names), robot, "walk")
     with pytest.raises(UserError, match="walk: the motion has 1 frame at 60 Hz, expected at least two"):
