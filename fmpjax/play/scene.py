@@ -97,10 +97,12 @@ class Figure:
           pulled: called with the body, the point of it that is held and where the pointer is, ``[3]`` m in the page.
           let_go: called at the end.
         """
+        # viser awaits coroutines one by one. It runs functions in threads, where the end could overtake a pull before
+        # it, which would then go on without a hand.
         for geoms, _, handle in self.batches:
 
             @handle.on_drag
-            def _(event, geoms=geoms) -> None:
+            async def _(event, geoms=geoms) -> None:
                 if event.phase == "end" or event.instance_index is None:
                     let_go()
                 else:

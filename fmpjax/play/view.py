@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 import viser
 
@@ -86,7 +85,6 @@ class View:
         with self._session.frozen():
             data, drag = self._session.players[i].simulation.data, self._session.players[i].drag
             if drag is None or drag.body != body:
-                local = np.zeros(3)
-                mujoco.mju_rotVecMatT(local, point - shift - data.xpos[body], data.xmat[body])
+                local = (point - shift - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
                 drag = Drag(body, local, target - shift)
             self._session.drag(i, Drag(body, drag.point, target - shift))
