@@ -504,20 +504,22 @@ def test_the_mouse_pulls_where_it_holds_the_robot_and_lets_go(page):
     lane = page.view._lanes[0] - page.view._middle
     body = int(player.simulation.model.geom_bodyid[batch.geoms[1]])
     held = player.simulation.data.xpos[body] + [0.0, 0.0, 0.02]
-    drags = []
-    for phase in ("start", "update", "end"):
-        pulled = held + [0.3 * (phase == "update"), 0.0, 0.0]
-        event = SimpleNamespace(
-            phase=phase, instance_index=1, start_position=tuple(held + lane), end_position=tuple(pulled + lane)
-        )
-        asyncio.run(entry.callback(event))
-        drags.append(player.drag)
+
+    def drag(phase, away=0.0):
+        places = {"start_position": tuple(held + lane), "end_position": tuple(held + lane + [away, 0.0, 0.0])}
+        asyncio.run(entry.callback(SimpleNamespace(phase=phase, instance_index=1, **places)))
+        return player.drag
+
+    drags = drag("start"), drag("update", 0.3), drag("end")
     assert drags[0].body == drags[1].body == body and drags[2] is None
     np.testing.assert_allclose(drags[1].target - drags[0].target, [0.3, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(
         player.simulation.data.xmat[body].reshape(3, 3) @ drags[0].point, [0.0, 0.0, 0.02], atol=1e-9
     )
     assert page.session.players[1].drag is None
+    drag("start")
+    page.session.reset()
+    assert drag("update", 0.3) is None  # it has slipped from the hand
 
 
 @needs_viser
