@@ -96,17 +96,24 @@ class Panel:
             if high - low < LEAST_SPAN:
                 continue
             slider = self._gui.add_slider(label, float(low), float(high), 0.01, 0.0)
-            slider.on_update(lambda _, axis=axis, slider=slider: self._tell(axis, slider.value))
+            slider.on_update(lambda event, axis=axis: self._slide(axis, event))
             self._sliders[axis] = slider
         self._gui.add_button("Stand", icon=viser.Icon.HAND_STOP).on_click(lambda _: self._stand())
 
-    def _tell(self, axis: int, value: float) -> None:
+    def _tell(self, axis: int, value: float, *, more: bool = False) -> None:
+        """Command ``value`` along an axis, or ``more`` by it than now."""
+        # Each key comes in a thread of its own, of which none may be lost. The slider is set without the session's
+        # lock: the loop of the page takes viser's before it.
         with self._session.frozen():
             command = self._session.command.copy()
-            command[axis] = value
+            command[axis] = command[axis] + value if more else value
             told = self._session.tell(command)
         if axis in self._sliders:
             self._set(self._sliders[axis], "value", round(float(told[axis]), 3))
+
+    def _slide(self, axis: int, event: viser.GuiEvent) -> None:
+        if event.client is not None:  # keys move the slider, too, and may be ahead of what it says
+            self._tell(axis, event.target.value)
 
     def _stand(self) -> None:
         for axis in self._sliders:
@@ -150,7 +157,7 @@ class Panel:
             for key, (axis, sign) in KEYS.items():
                 if axis in self._sliders:
                     label = f"{'More' if sign > 0 else 'Less'} {AXES[axis]}"
-                    add(label, key, lambda a=axis, s=sign: self._tell(a, self._session.command[a] + s * STEP))
+                    add(label, key, lambda a=axis, s=sign: self._tell(a, s * STEP, more=True))
             add("Stand", "X", self._stand)
         for key, direction in ARROWS.items():
             add(f"Push {direction}", key, lambda direction=direction: self._push(direction))

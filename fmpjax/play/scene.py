@@ -90,22 +90,26 @@ class Figure:
         for batch in self.batches:
             batch.handle.visible = not hidden
 
-    def on_drag(self, pulled: Callable[[int, np.ndarray, np.ndarray], None], let_go: Callable[[], None]) -> None:
+    def on_drag(self, pulled: Callable[[int, np.ndarray | None, np.ndarray], None], let_go: Callable[[], None]) -> None:
         """Call back while somebody drags it by the mouse.
 
         Args:
-          pulled: called with the body, the point of it that is held and where the pointer is, ``[3]`` m in the page.
+          pulled: called with the body, the point of it that is taken hold of (None where it is held already) and where
+            the pointer is, both ``[3]`` m in the page.
           let_go: called at the end.
         """
+        # viser awaits coroutines one by one. It runs functions in threads, where the end could overtake a pull before
+        # it, which would then go on without a hand.
         for geoms, _, handle in self.batches:
 
             @handle.on_drag
-            def _(event, geoms=geoms) -> None:
+            async def _(event, geoms=geoms) -> None:
                 if event.phase == "end" or event.instance_index is None:
                     let_go()
                 else:
                     body = int(self.model.geom_bodyid[geoms[event.instance_index]])
-                    pulled(body, np.array(event.start_position), np.array(event.end_position))
+                    taken = np.array(event.start_position) if event.phase == "start" else None
+                    pulled(body, taken, np.array(event.end_position))
 
 
 class Floor:

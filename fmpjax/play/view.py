@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 import viser
 
@@ -80,13 +79,18 @@ class View:
         share = 1.0 if np.linalg.norm(off) > FAR else 1.0 - np.exp(-passed / FOLLOWING)
         self._middle[:2] += share * off
 
-    def _pull(self, i: int, body: int, point: np.ndarray, target: np.ndarray) -> None:
-        """Pull player ``i`` at a point of the page toward another one."""
+    def _pull(self, i: int, body: int, taken: np.ndarray | None, target: np.ndarray) -> None:
+        """Pull player ``i`` toward a point of the page, from now on at ``taken``, or where it is held.
+
+        A robot that was put at its start has slipped from the hand, and has to be taken hold of again.
+        """
         shift = self._lanes[i] - self._middle
         with self._session.frozen():
             data, drag = self._session.players[i].simulation.data, self._session.players[i].drag
-            if drag is None or drag.body != body:
-                local = np.zeros(3)
-                mujoco.mju_rotVecMatT(local, point - shift - data.xpos[body], data.xmat[body])
-                drag = Drag(body, local, target - shift)
-            self._session.drag(i, Drag(body, drag.point, target - shift))
+            if taken is not None:
+                local = (taken - shift - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
+            elif drag is not None and drag.body == body:
+                local = drag.point
+            else:
+                return
+            self._session.drag(i, Drag(body, local, target - shift))

@@ -1,5 +1,6 @@
 """Robots in real time: the session without a browser, the policies of a run, and the server of the page."""
 
+import asyncio
 import importlib.util
 import json
 import os
@@ -482,6 +483,43 @@ def test_the_controls_do_what_they_say(page):
     assert "**run** best" in panel._status.content and "50 Hz" in panel._status.content
     page.view.ghosts(False)
     assert not any(batch.handle.visible for batch in page.view._shown[0].ghost.batches)
+
+
+@needs_viser
+def test_keys_at_once_all_count(page):
+    threads = [threading.Thread(target=page.panel._tell, args=(0, 0.01), kwargs={"more": True}) for _ in range(20)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert page.session.command[0] == pytest.approx(0.2)
+
+
+@needs_viser
+def test_the_mouse_pulls_where_it_holds_the_robot_and_lets_go(page):
+    """In the order of its events: viser awaits coroutines, and runs plain functions side by side."""
+    player, (batch, *_) = page.session.players[0], page.view._shown[0].robot.batches
+    page.view.update(0.04)
+    (entry,) = batch.handle._impl.drag_cb
+    lane = page.view._lanes[0] - page.view._middle
+    body = int(player.simulation.model.geom_bodyid[batch.geoms[1]])
+    held = player.simulation.data.xpos[body] + [0.0, 0.0, 0.02]
+
+    def drag(phase, away=0.0):
+        places = {"start_position": tuple(held + lane), "end_position": tuple(held + lane + [away, 0.0, 0.0])}
+        asyncio.run(entry.callback(SimpleNamespace(phase=phase, instance_index=1, **places)))
+        return player.drag
+
+    drags = drag("start"), drag("update", 0.3), drag("end")
+    assert drags[0].body == drags[1].body == body and drags[2] is None
+    np.testing.assert_allclose(drags[1].target - drags[0].target, [0.3, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        player.simulation.data.xmat[body].reshape(3, 3) @ drags[0].point, [0.0, 0.0, 0.02], atol=1e-9
+    )
+    assert page.session.players[1].drag is None
+    drag("start")
+    page.session.reset()
+    assert drag("update", 0.3) is None  # it has slipped from the hand
 
 
 @needs_viser
