@@ -30,7 +30,7 @@ class StyleDistance:
         self._map = features.fit_feature_map(trainer.robot, windows, config, share)
         self._expert = self._map(windows)
 
-    def __call__(self, frames: jax.Array, counts: np.ndarray) -> np.ndarray:
+    def __call__(self, frames: jax.Array | np.ndarray, counts: np.ndarray) -> np.ndarray:
         """Mean distance of each episode's windows, NaN where it has none.
 
         Args:
@@ -40,7 +40,7 @@ class StyleDistance:
         first = np.arange(0, len(frames) - self._horizon + 1, self._stride)
         steps = first[:, None] + np.arange(self._horizon)
         whole = np.asarray(counts)[steps].all(1)
-        distance = np.asarray(self._nearest(frames, jnp.asarray(steps)))
+        distance = np.asarray(self._nearest(jnp.asarray(frames), jnp.asarray(steps)))
         total, count = np.where(whole, distance, 0.0).sum(0), whole.sum(0)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
