@@ -27,6 +27,7 @@ TILTED, UPRIGHT = 0.94, 0.7  # cosine of a root's tilt: a doubtful mean, and tha
 PLAINLY = 2.0  # times less tilt or slip, by which the other order of the quaternion is the better one
 SLIPS = 0.3  # m/s over the floor, of the lowest sole point, from which a walk is doubtful
 STEPS = 300  # pairs of rows in which the soles are looked at
+JUDGED = 0.5  # s, of a file that is long enough for that
 LIMIT_SLACK = 0.2  # rad that a file may exceed a joint's limit by and still be in radians
 LISTED = 4  # joints that a sentence names
 
@@ -305,7 +306,7 @@ def _check_soles(file: Path, robot: Robot, position, xyzw: np.ndarray, angles: n
     A root that looks along -x is upright in both orders. In the wrong one it looks along +x, and walks backward. Only
     files that are read as xyzw are in doubt: MuJoCo's order is often written where others expect theirs.
     """
-    if len(xyzw) < 2 or rotations.up(xyzw).min() <= UPRIGHT:
+    if len(xyzw) < max(2, JUDGED * rate) or rotations.up(xyzw).min() <= UPRIGHT:
         return
     first = np.unique(np.linspace(0, len(xyzw) - 2, STEPS).astype(int))
     rows = np.stack([first, first + 1], axis=1).ravel()
