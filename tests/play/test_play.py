@@ -19,10 +19,11 @@ import pytest
 from fmpjax import cli, config, motion, play, policy, robots, sim2sim
 from fmpjax.config import preset
 from fmpjax.errors import UserError
-from fmpjax.play import server as serving
 from fmpjax.play.devices import Gamepad, Keyboard
 from fmpjax.play.player import Drag, Player, moved
 from fmpjax.sim2sim import ExportedPolicy
+
+serving = pytest.importorskip("fmpjax.play.server", reason="the extra play", exc_type=ImportError)
 
 HOLD = np.array([[-0.5, 0.0, -0.8], [1.0, 0.0, 0.8]])  # what the test's policies may be told
 
