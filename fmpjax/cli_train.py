@@ -2,18 +2,16 @@
 
 import contextlib
 import dataclasses
-import functools
 import os
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from fmpjax import cli_settings, machine
 from fmpjax import config as configuration
-from fmpjax import machine
-from fmpjax.config import explaining
+from fmpjax.cli_settings import preset_default
 from fmpjax.errors import UserError
 from fmpjax.shell import default
 
@@ -35,32 +33,10 @@ def runs_module():
     return runs
 
 
-@functools.cache
-def _preset(name: str) -> dict[str, Any]:
-    """The settings of a preset by their keys. Every start of the program asks for each of them several times."""
-    return configuration.flatten(configuration.preset(name))
+# Settings that have shorter names as options of both commands.
+_NAMED = ("preset", "method", "robot", "motion", "frames", "seed", "transitions")
 
-
-def _setting(key: str) -> object:
-    """For ``Annotated``: the default of an option that overrides a setting, which may depend on the preset."""
-    presets: dict[str, list[str]] = {}
-    for name in configuration.PRESETS:
-        value = _preset(name)[key]
-        presets.setdefault(f"{value:,}" if isinstance(value, int) else value, []).append(name)
-    if len(presets) == 1:
-        return default(*presets)
-    return default(", ".join(f"{value} in {explaining.enumerated(names)}" for value, names in presets.items()))
-
-
-def _set(items: Sequence[str]) -> dict[str, str]:
-    """The settings that ``--set`` names."""
-    changes = {}
-    for item in items:
-        key, equals, value = item.partition("=")
-        if not equals or key == "preset":
-            raise UserError(f"--set {item!r}: expected section.field=value")
-        changes[key] = value
-    return changes
+_Settings = Annotated[Any, tyro.conf.arg(name="", constructor_factory=lambda: cli_settings.options(*_NAMED))]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,9 +47,9 @@ class Pretrain:
     """`smp`, whose diffusion model is trained first."""
     preset: Annotated[str | None, default("laptop on a CPU, paper on an accelerator")] = None
     """`smoke`, `laptop`, `robust`, `robot` or `paper`."""
-    robot: Annotated[str | None, _setting("robot")] = None
+    robot: Annotated[str | None, preset_default("robot")] = None
     """A shipped robot, or a robot's folder."""
-    motion: Annotated[str | None, _setting("motion")] = None
+    motion: Annotated[str | None, preset_default("motion")] = None
     """Motions as `fmpjax train` takes them."""
     frames: Annotated[str | None, default("all")] = None
     """Source rows first:last of the motion, 0-based, both included; of several motions with commas between them."""
@@ -83,6 +59,7 @@ class Pretrain:
     """Train again even if the cache has it."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Any other setting as section.field=value; `smp.network=published` is the published network."""
+    settings: _Settings = dataclasses.field(default_factory=lambda: cli_settings.options(*_NAMED)())
 
     def __call__(self) -> None:
         from fmpjax import priors
@@ -94,8 +71,8 @@ class Pretrain:
         from fmpjax.trainer import Trainer
 
         named = {"robot": self.robot, "motion": self.motion, "frames": self.frames}
-        changes = {key: value for key, value in named.items() if value is not None} | _set(self.set)
-        changes = configuration.commanded(self.command, {**changes, "method": self.method})
+        changes = cli_settings.changes(self.settings, self.set, {**named, "method": self.method})
+        changes = configuration.commanded(self.command, changes)
         config = configuration.preset(self.preset or runs.default_preset(), **changes)
         config = configuration.with_changes(config, {"motion": library.listed(config.motion)})
         runs.check_trainable(config)
@@ -114,15 +91,15 @@ class Pretrain:
 class Train:
     """Train a policy from a demonstration."""
 
-    method: Annotated[str | None, _setting("method")] = None
+    method: Annotated[str | None, preset_default("method")] = None
     """Motion prior; `fmpjax list` shows all of them. `add` and `tracking` also set the command `phase`."""
-    reset: Annotated[str | None, _setting("env.reset")] = None
+    reset: Annotated[str | None, preset_default("env.reset")] = None
     """`dataset` (a demonstration state) or `fixed` (the default pose)."""
     preset: Annotated[str | None, default("laptop on a CPU, paper on an accelerator")] = None
     """`smoke`, `laptop`, `robust`, `robot` or `paper`; `fmpjax list` says what each is for."""
-    robot: Annotated[str | None, _setting("robot")] = None
+    robot: Annotated[str | None, preset_default("robot")] = None
     """A shipped robot, or a robot's folder."""
-    motion: Annotated[str | None, _setting("motion")] = None
+    motion: Annotated[str | None, preset_default("motion")] = None
     """A bundled motion's name, a file, a folder of files or an address (https://, hf://); several with weights as
     NAME[:WEIGHT],NAME[:WEIGHT]."""
     command: Annotated[str | None, default("none, or the run's own with --resume")] = None
@@ -132,11 +109,11 @@ class Train:
     """Accept the license of a Hugging Face data set without a question."""
     frames: Annotated[str | None, default("all")] = None
     """Source rows first:last of the motion, 0-based, both included; of several motions with commas between them."""
-    seed: Annotated[int | None, _setting("seed")] = None
+    seed: Annotated[int | None, preset_default("seed")] = None
     """Seed of everything that is random."""
     seeds: Annotated[int | None, default("a single run")] = None
     """Number of seeds to train at once, beginning with --seed, in one program: runs RUN/seed0, RUN/seed1, and so on."""
-    transitions: Annotated[int | None, _setting("transitions")] = None
+    transitions: Annotated[int | None, preset_default("transitions")] = None
     """Budget of environment steps; with --resume, a larger one continues a finished run."""
     run: Annotated[Path | None, default("runs/METHOD-DATE-TIME")] = None
     """Folder of the run."""
@@ -163,7 +140,9 @@ class Train:
     logger: Annotated[str | None, default("none")] = None
     """`wandb` (Weights & Biases) or `trackio`, which get the figures of metrics.csv; they stay on this machine."""
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Any other setting as section.field=value; `fmpjax settings` explains all of them."""
+    """Any setting as section.field=value, in place of its option below; `fmpjax settings` also explains the letters in
+    brackets."""
+    settings: _Settings = dataclasses.field(default_factory=lambda: cli_settings.options(*_NAMED)())
 
     def __call__(self) -> None:
         if self.minutes is not None and not self.minutes > 0:
@@ -297,8 +276,7 @@ class Train:
             "seed": self.seed,
             "transitions": self.transitions,
         }
-        changes: dict[str, object] = {key: value for key, value in named.items() if value is not None}
-        changes |= _set(self.set)
+        changes = cli_settings.changes(self.settings, self.set, named)
         if self.resume:
             return changes | ({} if self.command is None else {"command.kind": self.command})
         return configuration.commanded(self.command, changes)

@@ -10,7 +10,7 @@ import sys
 import pytest
 
 import fmpjax
-from fmpjax import cli, cli_train, config, experiments, motion, priors, robots
+from fmpjax import cli, config, experiments, motion, priors, robots
 from fmpjax.experiments.common import results
 
 
@@ -94,14 +94,6 @@ def test_help_names_the_defaults_of_training(shown):
         "transitions INT": "10,240 in smoke, 6,000,000 in laptop, 16,000,000 in robust and robot, 50,003,968 in paper",
     }.items():  # fmt: skip
         assert re.search(rf"--{option} [^(]*(\([^d][^(]*)*\(default: {value}\)", text), option
-
-
-def test_a_default_that_depends_on_the_preset_says_so(monkeypatch):
-    robots = {"paper": "another"}
-    monkeypatch.setattr(cli_train, "_preset", lambda name: {"robot": robots.get(name, "unitree_g1"), "method": "fmp"})
-    said = cli_train._setting("robot").help_behavior_hint
-    assert said == "(default: unitree_g1 in smoke, laptop, robust and robot, another in paper)"
-    assert cli_train._setting("method").help_behavior_hint == "(default: fmp)"
 
 
 def test_none_is_no_value(capsys):

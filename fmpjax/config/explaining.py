@@ -61,7 +61,8 @@ def markdown() -> str:
     lines = [
         "# Settings",
         "",
-        "`--set section.field=value` changes a setting, and `fmpjax settings [SECTION]` explains it. This page is what",
+        "`--section.field VALUE` changes a setting in `fmpjax train` and `fmpjax pretrain`, and so does",
+        "`--set section.field=value`. `fmpjax settings [SECTION]` explains it, and so does `--help`. This page is what",
         "`fmpjax settings --markdown` prints.",
         "",
         textwrap.fill(f"Letters in brackets name the source of a number: {_legend()}.", 120),
@@ -74,7 +75,7 @@ def markdown() -> str:
         lines += ["|" + "---|" * (len(PRESETS) + 3)]
         for setting in settings().values():
             if setting.key.rpartition(".")[0] == section:
-                cells = [f"`{setting.key}`", *(f"`{_shown(value)}`" for value in setting.values.values())]
+                cells = [f"`{setting.key}`", *(f"`{shown(value)}`" for value in setting.values.values())]
                 cells += [setting.meaning, setting.expected]
                 lines.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
     return "\n".join(lines) + "\n"
@@ -86,6 +87,7 @@ def sections() -> Mapping[str, str]:
     return {name: type(value).__doc__ for name, value in found.items() if isinstance(value, Section)}
 
 
+@functools.cache
 def _comments(section: type) -> Mapping[str, str]:
     """The comment of each field, behind it or right above it."""
     found = {}
@@ -101,10 +103,10 @@ def _comments(section: type) -> Mapping[str, str]:
     return found
 
 
-def _shown(value: Any) -> str:
-    """A value as `--set` takes it."""
+def shown(value: Any) -> str:
+    """A value as the command line takes it."""
     if isinstance(value, tuple):
-        return ",".join(map(_shown, value))
+        return ",".join(map(shown, value))
     return str(value).lower() if isinstance(value, bool) else str(value) or '""'
 
 
@@ -120,9 +122,9 @@ def _differing(setting: Setting) -> str:
     differing: dict[str, list[str]] = {}
     for name, value in others:
         if value != common:
-            differing.setdefault(_shown(value), []).append(name)
+            differing.setdefault(shown(value), []).append(name)
     departures = ", ".join(f"{value} in {enumerated(names)}" for value, names in differing.items())
-    return _shown(common) + (f" ({departures})" if departures else "")
+    return shown(common) + (f" ({departures})" if departures else "")
 
 
 def _legend() -> str:
