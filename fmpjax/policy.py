@@ -60,7 +60,8 @@ class Policy(NamedTuple):
                 f"the observation has {length[0] if length else 'no'} numbers: expected {len(self.mean)}, "
                 f"for the observation {self.observation!r} of this policy"
             )
-        x = np.clip((observation - self.mean) / self.deviation, -self.clip, self.clip)
+        # In double precision: a robot gets the same targets alone and in a batch, whatever library multiplies.
+        x = np.clip((np.float64(observation) - self.mean) / self.deviation, -self.clip, self.clip)
         for kernel, bias in zip(self.kernels[:-1], self.biases[:-1], strict=True):
             x = _ACTIVATIONS[self.activation](x @ kernel + bias)
         action = x @ self.kernels[-1] + self.biases[-1]

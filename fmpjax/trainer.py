@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from fmpjax import commands, features, learning, metrics, mirror, physics, priors, robots, sharding
+from fmpjax import commands, features, learning, metrics, mirror, physics, priors, products, robots, sharding
 from fmpjax.config import Config
 from fmpjax.env import PER_ENVIRONMENT, Env, EnvState, Steps
 from fmpjax.errors import UserError
@@ -106,8 +106,7 @@ class Trainer:
 
     def precision(self) -> contextlib.AbstractContextManager:
         """The precision of the matrix products of what is traced within; the physics has its own."""
-        wanted = self.config.precision
-        return contextlib.nullcontext() if wanted == "default" else jax.default_matmul_precision(wanted)
+        return products.at_precision(self.config.precision)
 
     def _iteration(self, state: TrainState) -> tuple[TrainState, Metrics]:
         key, rollout_key, prior_key, ppo_key = jax.random.split(state.key, 4)

@@ -254,8 +254,9 @@ class Config(Section):
     frames: str = ""  # rows of the motion's file as "first:last", both included; empty: all [D]
     preset: str = "paper"  # preset from which the other settings start
     seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 0  # seed of all random numbers [D]
-    # precision of the networks' products [M]; "default": TF32 on NVIDIA GPUs
-    precision: Literal["float32", "default"] = "float32"
+    # precision of the networks' products [M]; "bfloat16": rounded factors, summed in float32, faster on CPUs with
+    # instructions for it [D]; "default": TF32 on NVIDIA GPUs
+    precision: Literal["float32", "bfloat16", "default"] = "float32"
     transitions: PositiveInt = 50_003_968  # budget: environment steps of the whole run [P]
     # shares of the budget at which the policy is evaluated [P]; episodes of the training continue, the paper's restart
     # [D]

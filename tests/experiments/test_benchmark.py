@@ -1,7 +1,6 @@
 """The benchmark: its plan, cells that survive a kill and run once, here and on a cluster, and a prior that joins."""
 
 import csv
-import importlib.util
 import json
 import os
 import re
@@ -22,9 +21,13 @@ from fmpjax.experiments.common.work import Task
 from tests.helpers import TINY
 
 SMALL = {key: ",".join(map(str, v)) if isinstance(v, tuple) else v for key, v in TINY.items()}
-needs_submitit = pytest.mark.skipif(
-    importlib.util.find_spec("submitit") is None, reason="the extra benchmark is not installed"
-)
+try:
+    # Here and not in a test: its import closes the streams of all log handlers but the standard ones, which in a test
+    # are those that capture the output.
+    import submitit
+except ImportError:
+    submitit = None
+needs_submitit = pytest.mark.skipif(submitit is None, reason="the extra benchmark is not installed")
 
 
 def small(*methods, motions=("walk",), seeds=(0,)):
