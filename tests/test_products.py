@@ -57,7 +57,8 @@ def test_layers_within_have_rounded_products_and_the_same_parameters(bias):
         found = jax.jit(layer.apply)(params, x)
     assert jax.tree.all(jax.tree.map(np.array_equal, exact, params))
     kernel, shift = exact["params"]["kernel"], exact["params"].get("bias", 0.0)
-    np.testing.assert_array_equal(found, products.rounded_product(x, kernel) + shift)
+    np.testing.assert_allclose(found, products.rounded_product(x, kernel) + shift, atol=1e-6)
+    assert not np.allclose(found, layer.apply(exact, x), atol=1e-6)
     np.testing.assert_allclose(layer.apply(exact, x), jnp.matmul(x, kernel, precision="highest") + shift, atol=1e-6)
 
 
