@@ -27,6 +27,8 @@ class Sim2Sim:
     """Gains of the servos: the policy's, or those of the model, which then needs position servos."""
     course: Annotated[tuple[str, ...], default("a walk, a turn and a stop")] = ()
     """Commands for the policy, if it takes any, as SECONDS:FORWARD,LEFT,TURN in m/s and rad/s, leg by leg."""
+    push: float = 0.0
+    """Push the robot by this speed (m/s) in a random horizontal direction every two seconds."""
     video: Annotated[Path | None, default("no video")] = None
     """Film the first episode: a file .mp4, or .gif where no encoder is installed."""
     keyboard: bool = False
@@ -43,6 +45,8 @@ class Sim2Sim:
             raise UserError(f"--seconds is {self.seconds:g}: expected a number above 0")
         if self.episodes < 1:
             raise UserError(f"--episodes is {self.episodes}: expected at least 1")
+        if not 0 <= self.push < math.inf:
+            raise UserError(f"--push is {self.push:g}: expected a speed of at least 0")
         if self.video is not None and self.video.suffix not in (".mp4", ".gif"):
             raise UserError(f"--video is {self.video}: expected a name that ends in .mp4 or .gif")
         course = sim2sim.course(self.course)
@@ -52,7 +56,7 @@ class Sim2Sim:
         if not course and "velocity_commands" in policy.terms:
             course = sim2sim.COURSE
         simulation = sim2sim.Simulation(policy, self.model, own_gains=self.gains == "model")
-        played = sim2sim.play(simulation, seconds=self.seconds, episodes=self.episodes, course=course)
+        played = sim2sim.play(simulation, seconds=self.seconds, episodes=self.episodes, course=course, push=self.push)
         print(sim2sim.report(simulation, played, course))
         if robot is not None and self.video is not None:
             from fmpjax.viz import render
@@ -64,8 +68,8 @@ class Sim2Sim:
         from fmpjax import play, sim2sim
 
         option = "--gamepad" if self.gamepad else "--keyboard"
-        if self.course or self.video is not None:
-            raise UserError(f"{option} is steered by hand: expected no --course and no --video")
+        if self.course or self.push or self.video is not None:
+            raise UserError(f"{option} is steered by hand: expected no --course, no --push and no --video")
         play.check_display(option)
         simulation = sim2sim.Simulation(sim2sim.load(self.policy), self.model, own_gains=self.gains == "model")
         for sentence in simulation.differences:

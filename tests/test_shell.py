@@ -108,6 +108,11 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"fmpjax {fmpjax.__version__}\n"
 
 
+def test_the_package_is_the_command(capfd):
+    assert _process("-m", "fmpjax", "--version").wait(timeout=120) == 0
+    assert capfd.readouterr().out == f"fmpjax {fmpjax.__version__}\n"
+
+
 def test_list_describes_everything(capsys):
     cli.main(["list"])
     groups, title = {}, None

@@ -10,6 +10,7 @@ from fmpjax.sim2sim.simulation import Simulation
 
 # Seconds and command (m/s, m/s, rad/s) of each leg, for a policy that takes commands and is told nothing else.
 COURSE = ((4.0, (0.5, 0.0, 0.0)), (4.0, (0.5, 0.0, 0.4)), (2.0, (0.0, 0.0, 0.0)))
+EVERY = 2.0  # s between two pushes, as in `fmpjax evaluate --robust`
 Course = Sequence[tuple[float, tuple[float, float, float]]]
 
 
@@ -51,6 +52,7 @@ def play(
     noise: float = 0.02,
     seed: int = 0,
     course: Course | None = None,
+    push: float = 0.0,
 ) -> list[Episode]:
     """Run the policy from its default pose, the first time exactly, then with joints a little off.
 
@@ -61,6 +63,7 @@ def play(
       noise: rad, standard deviation of the joint angles; ten times that in rad/s of their velocities.
       seed: of the noise.
       course: seconds and command of each leg, for a policy that takes commands.
+      push: m/s, added to the root's velocity in a random horizontal direction every two seconds.
 
     Raises:
       UserError: there is a course, and the policy takes no commands.
@@ -69,14 +72,17 @@ def play(
         raise UserError("the policy takes no commands: expected no course")
     course = course or ((seconds, (0.0, 0.0, 0.0)),)
     ends, commands = np.cumsum([leg for leg, _ in course]), np.array([command for _, command in course])
-    random, played = np.random.default_rng(seed), []
+    random, directions, played = np.random.default_rng(seed), np.random.default_rng([seed, 1]), []
     for episode in range(episodes):
         off = random.normal(size=(2, len(sim.policy.joint_names))) * noise * np.array([[1.0], [10.0]])
         sim.reset(off if episode else None)
-        qpos, velocities, legs, fell = [sim.qpos], [], [], False
+        qpos, velocities, legs, fell, pushes = [sim.qpos], [], [], False, 1
         while not fell and sim.time < ends[-1] - 1e-9:
             legs.append(int(np.searchsorted(ends - 1e-9, sim.time, side="right")))
             sim.command = commands[legs[-1]]
+            if push and sim.time > EVERY * pushes - 1e-9:
+                angle, pushes = directions.uniform(0.0, 2.0 * np.pi), pushes + 1
+                sim.push(push * np.array([np.cos(angle), np.sin(angle)]))
             fell = sim.step()
             velocities.append(sim.velocity())
             if np.isfinite(sim.qpos).all():

@@ -174,6 +174,10 @@ class Simulation:
             self.errors = self.errors + newest * (counted - self.errors)
         return any((self._point(body, ends)[:, 2] < radius).any() for body, ends, radius in self._falls)
 
+    def push(self, velocity: np.ndarray) -> None:
+        """Add ``velocity [2]`` (m/s, along the world's x and y) to the root's."""
+        self.data.qvel[self._root_dof : self._root_dof + 2] += velocity
+
     def velocity(self) -> np.ndarray:
         """Velocity of the root forward and to the left in its own heading (m/s), and its turn (rad/s), ``[3]``."""
         x, y = self.facing

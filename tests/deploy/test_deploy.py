@@ -482,6 +482,35 @@ def test_a_course_tells_its_legs_one_after_another(sensed, robot, tmp_path, monk
     assert "for 0.06 s: nothing, each episode had ended in a fall" in sim2sim.report(sim, fell, course)
 
 
+@needs_onnx
+def test_pushes_come_every_two_seconds_from_any_side(sensed, robot, tmp_path, monkeypatch):
+    from fmpjax import sim2sim
+
+    sim = sim2sim.Simulation(sim2sim.load(sensed.paths[0]), mjcf(robot, tmp_path / "g1.xml"))
+    sim.push(np.array([0.3, -0.4]))
+    np.testing.assert_array_equal(sim.qvel[:6], [0.3, -0.4, 0, 0, 0, 0])
+    pushed = []
+    monkeypatch.setattr(sim, "step", lambda: setattr(sim, "time", sim.time + 0.02))  # it stands, whatever comes
+    monkeypatch.setattr(sim, "push", lambda velocity: pushed.append((round(sim.time, 2), velocity)))
+    sim2sim.play(sim, seconds=6.0, episodes=2, push=0.5)
+    assert [time for time, _ in pushed] == [2.0, 4.0] * 2
+    velocities = np.array([velocity for _, velocity in pushed])
+    np.testing.assert_allclose(np.linalg.norm(velocities, axis=1), 0.5)
+    assert len(np.unique(velocities[:, 0].round(6))) == 4
+    pushed.clear()
+    sim2sim.play(sim, seconds=6.0, episodes=1)
+    assert not pushed
+
+
+@needs_onnx
+def test_a_push_that_is_no_speed_is_refused(exported, capsys):
+    for value in ("-1", "nan"):
+        with pytest.raises(SystemExit) as exit_:
+            cli.main(["sim2sim", str(exported), "--model", "g1.xml", "--push", value])
+        assert exit_.value.code == 2
+        assert f"--push is {value}: expected a speed of at least 0" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("leg", ["4", "4:1,0", "0:1,0,0", "x:1,0,0", "4:1,0,nan"])
 def test_a_leg_that_cannot_be_read_is_refused(leg):
     from fmpjax import sim2sim
