@@ -55,7 +55,7 @@ def _pictures(run: Run, trainer: Trainer, played: Episodes) -> list[Path]:
 
     makers = {"frames.png": frames}
     makers |= {"curves.png": course} if (run.folder / "metrics.csv").exists() else {}
-    makers |= {"policy.mp4": lambda: video(run, trainer, played)}
+    makers |= {"policy.mp4": lambda: video(run, trainer, played, smooth=False)}
     paths = []
     for name, make in makers.items():
         try:
@@ -171,6 +171,7 @@ def video(
     seconds: float = 10.0,
     path: Path | None = None,
     alone: bool = False,
+    smooth: bool = True,
 ) -> Path:
     """The policy beside the demonstration, or alone, as a video; the path written.
 
@@ -185,7 +186,8 @@ def video(
     if not alone:
         shown["demonstration"] = trainer.library.clips[played.clip[episode]].qpos[:last:stride]
     panes = len(shown)
-    frames = render.grid(trainer.robot, list(shown.values()), list(shown), columns=panes, width=360 * panes, height=360)
+    motions, labels = list(shown.values()), list(shown)
+    frames = render.grid(trainer.robot, motions, labels, columns=panes, width=360 * panes, height=360, smooth=smooth)
     return render.write_video(path or run.folder / "policy.mp4", frames, fps=rate / stride)
 
 

@@ -67,12 +67,15 @@ class DriverError(Exception):
 
 
 @contextlib.contextmanager
-def drawing(name: str, robot: Robot, width: int, height: int, distance: float) -> Generator[Picture]:
-    """Draw with MuJoCo through the OpenGL platform ``name``."""
+def drawing(
+    name: str, robot: Robot, width: int, height: int, distance: float, *, smooth: bool = True
+) -> Generator[Picture]:
+    """Draw with MuJoCo through the OpenGL platform ``name``, with smooth edges or, in half the time, without."""
     model = copy.copy(robot.model)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     quality = model.vis.quality  # more is not seen at this size; without a GPU drawing takes a third less time
     quality.numslices, quality.numstacks, quality.shadowsize = 14, 10, 1024
+    quality.offsamples = quality.offsamples if smooth else 0
     data = mujoco.MjData(model)
     camera, option, perturb = mujoco.MjvCamera(), mujoco.MjvOption(), mujoco.MjvPerturb()
     camera.azimuth, camera.elevation, camera.distance = AZIMUTH, ELEVATION, distance

@@ -34,6 +34,7 @@ def render_frames(
     follow: bool = True,
     labels: str | Sequence[str] | None = None,
     using: str | None = None,
+    smooth: bool = True,
 ) -> np.ndarray:
     """Draw a motion.
 
@@ -46,6 +47,7 @@ def render_frames(
       follow: move the camera with the root, smoothly; otherwise it is fixed and sees the whole path.
       labels: a caption, or one per frame.
       using: one of `BACKENDS` instead of the one that `backend` finds.
+      smooth: draw smooth edges, which without a GPU takes twice the time.
 
     Returns:
       ``uint8 [T, height, width, 3]``.
@@ -69,7 +71,7 @@ def render_frames(
         return frames
     if using != "skeleton":
         try:
-            _draw(functools.partial(opengl.drawing, using), robot, motions, captions, follow, frames)
+            _draw(functools.partial(opengl.drawing, using, smooth=smooth), robot, motions, captions, follow, frames)
             return frames
         except opengl.DriverError as error:
             opengl.say(f"the renderer {using!r} failed ({error}): pictures are drawn by 'skeleton' instead")
@@ -97,6 +99,7 @@ def grid(
     width: int = 960,
     height: int = 640,
     using: str | None = None,
+    smooth: bool = True,
 ) -> np.ndarray:
     """Draw several motions at once, each in a pane with its label; shorter ones hold their last frame.
 
@@ -108,6 +111,7 @@ def grid(
       width: pixels, of all panes together.
       height: pixels, of all panes together.
       using: as in `render_frames`.
+      smooth: likewise.
 
     Returns:
       ``uint8 [longest T, height, width, 3]``.
@@ -122,7 +126,9 @@ def grid(
     for index, (qpos, label) in enumerate(zip(motions, labels, strict=True)):
         row, column = divmod(index, columns)
         top, left, low, right = down[row], across[column], down[row + 1] - gap, across[column + 1] - gap
-        pane = render_frames(robot, qpos, width=right - left, height=low - top, labels=label, using=using)
+        pane = render_frames(
+            robot, qpos, width=right - left, height=low - top, labels=label, using=using, smooth=smooth
+        )
         frames[:, top:low, left:right] = pane[np.minimum(np.arange(length), len(pane) - 1)]
     return frames
 

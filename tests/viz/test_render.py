@@ -52,6 +52,13 @@ def test_ghost_and_labels_change_the_picture(robot, walk, using):
     assert (plain != labeled).any(axis=(1, 2, 3)).tolist() == [False, True, False]
 
 
+@pytest.mark.skipif(render.backend() == "skeleton", reason="MuJoCo draws nothing here")
+def test_edges_are_smooth_unless_told_otherwise(robot, walk):
+    smooth, rough = (render.render_frames(robot, walk[:1], smooth=value, **SIZE)[0] for value in (True, False))
+    jump = lambda image: np.abs(np.diff(image.astype(int).sum(-1), axis=1)).max()  # noqa: E731
+    assert (smooth != rough).any() and jump(rough) > jump(smooth)
+
+
 def test_still_camera_sees_the_robot_cross_the_picture(robot, walk):
     walk = np.repeat(walk[:1], 2, axis=0)
     walk[1, 0] += 2.0
