@@ -48,6 +48,10 @@ class MotionClip:
     def __len__(self) -> int:
         return len(self.qpos)
 
+    def __repr__(self) -> str:
+        length = f"{self.duration:.2f} s, {len(self)} samples at {self.rate:g} Hz"
+        return f"MotionClip({self.name} of {self.robot}, {length})"
+
     @property
     def duration(self) -> float:
         """Time from the first sample to the last, s."""

@@ -356,3 +356,7 @@ def test_the_demonstration_of_the_paper():
     assert np.linalg.norm(loaded.qvel[:, :2], axis=1).mean() == pytest.approx(0.868, abs=0.005)
     assert 0.73 < loaded.qpos[:, 2].min() < loaded.qpos[:, 2].max() < 0.80
     assert np.all(loaded.qpos[:, 3] > 0)  # the file's own sign is negative throughout this range
+
+
+def test_a_clip_is_shown_in_one_line():
+    assert repr(motion.load("walk")) == "MotionClip(walk of unitree_g1, 7.56 s, 379 samples at 50 Hz)"
