@@ -30,7 +30,7 @@ class Evaluate:
     last: bool = False
     """Take the newest checkpoint instead of the best."""
     commands: bool = False
-    """Measure how well a policy follows its velocity commands, or the time in the clip; docs/steering.md."""
+    """Measure how well a policy obeys its command: velocities, the time in the clip or motions; docs/steering.md."""
     robust: bool = False
     """Measure how often a policy falls under pushes, delays and other disturbances; docs/robustness.md."""
 
@@ -55,10 +55,10 @@ class Evaluate:
         print(f"wrote {path}")
 
     def _commands(self, run, trainer, state) -> None:
-        from fmpjax import following, steering
+        from fmpjax import following, performing, steering
         from fmpjax.viz import along, heat
 
-        trainer.config.command.require("velocity", "phase")
+        trainer.config.command.require("velocity", "phase", "motion")
         if sentence := steering.beyond(trainer):
             print(f"note: {sentence}")
         print("compiling the episodes ...", flush=True)
@@ -67,6 +67,11 @@ class Evaluate:
             followed = following.measure(trainer, state.ppo, **changed)
             print(f"iteration {int(state.iteration):,}:\n{following.table(followed)}")
             self._save(run, "following", followed, along.draw, followed.seconds, following.curves(followed))
+            return
+        if trainer.config.command.kind == "motion":
+            performed = performing.measure(trainer, state.ppo, **changed)
+            print(f"iteration {int(state.iteration):,}:\n{performing.table(performed)}")
+            self._save(run, "performing", performed, heat.draw_motions, performed.motions, performed.performed)
             return
         found = steering.measure(trainer, state.ppo, **changed)
         print(f"iteration {int(state.iteration):,}:\n{steering.table(found)}")

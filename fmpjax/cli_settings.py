@@ -67,12 +67,13 @@ def changes(given: Any, items: Sequence[str], named: Mapping[str, object]) -> di
       named: settings that the command has options for by other names; those that are None were not given.
 
     Raises:
-      UserError: an item is not of that form, or a setting is given twice with different values.
+      UserError: an item is not of that form, or a setting is given in two of these ways with different values.
     """
     found: dict[str, object] = {key: value for key, value in named.items() if value is not None}
-    for key, value in [*_given(given), *map(_item, items)]:
+    listed = dict(map(_item, items))  # of two for one setting the last counts
+    for key, value in [*_given(given), *listed.items()]:
         if str(found.setdefault(key, value)) != value:
-            raise UserError(f"setting {key} is given twice, as {found[key]} and as {value}: expected one value")
+            raise UserError(f"setting {key} is given in two ways, as {found[key]} and as {value}: expected one of them")
     return found
 
 

@@ -48,9 +48,10 @@ def test_options_are_the_settings_that_they_name():
 def test_a_setting_that_is_given_twice_has_one_value():
     options = cli_settings.options("preset")()
     assert cli_settings.changes(options, ("env.count=8", "env.count=8"), {"seed": 3}) == {"env.count": "8", "seed": 3}
-    with pytest.raises(UserError, match=r"setting env.count is given twice, as 8 and as 9: expected one value"):
-        cli_settings.changes(options, ("env.count=8", "env.count=9"), {})
-    with pytest.raises(UserError, match=r"setting env.reset is given twice, as fixed and as dataset"):
+    assert cli_settings.changes(options, ("env.count=8", "env.count=9"), {}) == {"env.count": "9"}
+    with pytest.raises(UserError, match=r"setting seed is given in two ways, as 3 and as 4: expected one of them"):
+        cli_settings.changes(options, ("seed=4",), {"seed": 3})
+    with pytest.raises(UserError, match=r"setting env.reset is given in two ways, as fixed and as dataset"):
         _changes("--env.reset", "dataset", named={"env.reset": "fixed"})
     with pytest.raises(UserError, match=r"--set 'env.count': expected section.field=value"):
         cli_settings.changes(options, ("env.count",), {})

@@ -22,8 +22,9 @@ from fmpjax.trainer import Trainer, TrainState
 from fmpjax.viz import curves, render
 
 _EXPORTED = (
-    "metrics.csv evaluation.json steering.json following.json robustness.json ranking-start.json ranking.json "
-    "curves.png steering.png following.png robustness.png frames.png policy.mp4 policy.gif course.mp4"
+    "metrics.csv evaluation.json steering.json following.json performing.json robustness.json "
+    "ranking-start.json ranking.json "
+    "curves.png steering.png following.png performing.png robustness.png frames.png policy.mp4 policy.gif course.mp4"
 ).split()
 
 
