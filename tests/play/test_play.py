@@ -587,7 +587,7 @@ def test_what_does_not_go_together_is_refused(run, robot, tmp_path, monkeypatch,
         (["sim2sim", file, "--model", file, "--gamepad"], "--gamepad opens a window, and there is no display"),
         (
             ["sim2sim", file, "--model", file, "--keyboard", "--course", "1:1,0,0"],
-            "expected no --course and no --video",
+            "expected no --course, no --push and no --video",
         ),
         (["motion", "view", "walk", "--browser", "--out", "a.png"], "--browser and --out do not go together"),
     ):
