@@ -33,7 +33,7 @@ def runs_module():
     return runs
 
 
-# Settings that have shorter names as options of both commands.
+# Settings without an option of their section: each command has its own for them, or does without.
 _NAMED = ("preset", "method", "robot", "motion", "frames", "seed", "transitions")
 
 _Settings = Annotated[Any, tyro.conf.arg(name="", constructor_factory=lambda: cli_settings.options(*_NAMED))]
