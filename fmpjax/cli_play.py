@@ -29,8 +29,8 @@ class Play:
     """Open MuJoCo's own viewer instead of a page, for one policy; needs a display."""
     gamepad: bool = False
     """Also steer with a gamepad; needs --native."""
-    parent: Annotated[int | None, tyro.conf.Suppress] = None
-    """Of `train --live`: the process without which the page ends."""
+    parent: Annotated[int | None, default("none")] = None
+    """ID of a process with which the page ends, too; `train --live` gives its own."""
 
     def __call__(self) -> None:
         from fmpjax import play

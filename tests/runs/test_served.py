@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fmpjax import policy, sim2sim
+from fmpjax import policy, shell, sim2sim
 from fmpjax.checkpoint import _flatten
+from fmpjax.cli import COMMANDS
 from fmpjax.commands import velocity
 from fmpjax.errors import UserError
 from fmpjax.play.reader import Reader
@@ -104,6 +105,8 @@ def test_a_run_that_trains_writes_its_policy_now_and_then(run, monkeypatch):
         live.open(session)
         command = ["-m", "fmpjax.cli", "play", str(run.folder), "--checkpoint", "live", "--port", "8123"]
         assert started[0][1:] == [*command, "--parent", str(os.getpid())]
+        play = shell.parse(COMMANDS, "fmpjax", started[0][3:])
+        assert (play.what, play.checkpoint, play.port, play.parent) == ((run.folder,), "live", 8123, os.getpid())
         assert read_npz(file).robot == "unitree_g1" and policy.metadata(file)["iteration"] == "0"
         session.done, now[0] = 2, 101.0
         live.show(session)
