@@ -33,6 +33,19 @@ class Batch(NamedTuple):
     handle: viser.BatchedMeshHandle
 
 
+class Pose(NamedTuple):
+    """Where a robot is."""
+
+    places: np.ndarray  # [geoms, 3] m
+    bodies: np.ndarray  # [bodies, 3] m
+    turns_wxyz: np.ndarray  # [bodies, 4]
+
+    @classmethod
+    def of(cls, data: mujoco.MjData) -> "Pose":
+        """A copy of the state whose kinematics ``data`` holds."""
+        return cls(data.geom_xpos.copy(), data.xpos.copy(), data.xquat.copy())
+
+
 class Figure:
     """A robot, or its demonstration, in the page."""
 
@@ -72,18 +85,18 @@ class Figure:
         )
         return Batch(np.array([p.geom for p in pieces]), np.array([p.offset for p in pieces]), handle)
 
-    def pose(self, data: mujoco.MjData, shift: np.ndarray) -> None:
-        """Show the state whose kinematics ``data`` holds, moved by ``shift [3]`` m."""
-        wxyz = rotations.multiply(data.xquat[self.model.geom_bodyid], self.model.geom_quat)
+    def pose(self, pose: Pose, shift: np.ndarray) -> None:
+        """Show it in a pose, moved by ``shift [3]`` m."""
+        wxyz = rotations.multiply(pose.turns_wxyz[self.model.geom_bodyid], self.model.geom_quat)
         for geoms, offsets, handle in self.batches:
-            places = data.geom_xpos[geoms] + rotations.rotate(wxyz[geoms], offsets) + shift
+            places = pose.places[geoms] + rotations.rotate(wxyz[geoms], offsets) + shift
             handle.batched_positions, handle.batched_wxyzs = places.astype(np.float32), wxyz[geoms].astype(np.float32)
 
     def show(self, qpos: np.ndarray, shift: np.ndarray) -> None:
         """Show a configuration of the model, ``[nq]``."""
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self.data)
-        self.pose(self.data, shift)
+        self.pose(Pose.of(self.data), shift)
 
     def hide(self, hidden: bool) -> None:
         """Take it out of sight, or show it again."""

@@ -6,7 +6,7 @@ import numpy as np
 import viser
 
 from fmpjax.play.player import Drag, Player
-from fmpjax.play.scene import Figure, Floor
+from fmpjax.play.scene import Figure, Floor, Pose
 from fmpjax.play.session import Session
 
 LANE = 1.5  # m between robots in the page; each is alone in its own world
@@ -55,21 +55,20 @@ class View:
 
     def update(self, passed: float) -> None:
         """Show where everything is now, ``passed`` s after the last time."""
-        ghosts = []
+        # The simulation waits while it is frozen: what is seen is only copied then, and sent afterwards.
         with self._session.frozen():
             if self.watched is not None:
                 self._follow(self._session.players[self.watched], passed)
-            for shown, lane in zip(self._shown, self._lanes, strict=True):
-                shift = lane - self._middle
-                data = shown.player.simulation.data
-                if np.isfinite(data.qpos).all():
-                    shown.robot.pose(data, shift)
-                if shown.label is not None:
-                    shown.label.position = tuple(data.xpos[shown.player.simulation.root_body] + shift + [0, 0, 0.75])
-                if shown.ghost is not None and shown.player.ghost is not None:
-                    ghosts.append((shown.ghost, shown.player.ghost.qpos(), shift))
-        for figure, qpos, shift in ghosts:
-            figure.show(qpos, shift)
+            seen = [(Pose.of(one.player.simulation.data), _ghost(one)) for one in self._shown]
+        for shown, lane, (pose, ghost) in zip(self._shown, self._lanes, seen, strict=True):
+            shift = lane - self._middle
+            if np.isfinite(pose.places).all():
+                shown.robot.pose(pose, shift)
+            if shown.label is not None:
+                root = pose.bodies[shown.player.simulation.root_body]
+                shown.label.position = tuple(root + shift + [0, 0, 0.75])
+            if shown.ghost is not None and ghost is not None:
+                shown.ghost.show(ghost, shift)
         self._floor.shift(-self._middle)
 
     def _follow(self, player: Player, passed: float) -> None:
@@ -94,3 +93,7 @@ class View:
             else:
                 return
             self._session.drag(i, Drag(body, local, target - shift))
+
+
+def _ghost(shown: _Shown) -> np.ndarray | None:
+    return None if shown.ghost is None or shown.player.ghost is None else shown.player.ghost.qpos()
