@@ -1,5 +1,6 @@
 """What several tests make: the smallest run, the smallest rollout for a prior, robots that differ from their model."""
 
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -59,6 +60,15 @@ SMALL = Config(
 
 def tiny(**changes):
     return preset("smoke", **(TINY | changes))
+
+
+def disturbed(**changes):
+    """The smallest run with all disturbances of the preset `robot`, more often pushed, that obeys commands."""
+    own = dataclasses.asdict(preset("robot").disturbance) | {"push_interval": (0.04, 0.1)}
+    own = {f"disturbance.{name}": value for name, value in own.items()}
+    own |= {"env.observation": "deployable", "env.observation_history": 2, "env.first_cap": 5}
+    own |= {"command.kind": "velocity", "env.axes": "heading", "features.axes": "heading"}
+    return tiny(**(own | changes))
 
 
 def settings(values):

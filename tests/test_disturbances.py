@@ -1,7 +1,5 @@
 """Disturbances in closed form: pushes, late actions, sensors that err, what is drawn, and what the networks see."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +11,7 @@ from fmpjax.actions import action_map
 from fmpjax.config import DisturbanceConfig, preset
 from fmpjax.env import Env
 from fmpjax.errors import UserError
-from tests.helpers import tiny
+from tests.helpers import disturbed
 
 COUNT = 1000  # the same in all tests, for which JAX compiles its operations once
 
@@ -289,7 +287,7 @@ def test_a_history_holds_each_terms_steps_oldest_first(robot, walk):
 @pytest.fixture(scope="module")
 def played():
     """Two rollouts of the `robot` preset's disturbances, faster than usual, and the environment before and after."""
-    config, one = tiny(**preset_changes()), robots.load("unitree_g1")
+    config, one = disturbed(), robots.load("unitree_g1")
     env = Env(one, motion.load("walk"), config, physics.make(one, config.physics))
     joints = one.joint_count
 
@@ -301,13 +299,6 @@ def played():
     middle, first = roll(start, jax.random.PRNGKey(1))
     end, second = roll(middle, jax.random.PRNGKey(2))
     return env, (start, middle, end), (first, second), roll
-
-
-def preset_changes():
-    own = dataclasses.asdict(preset("robot").disturbance)
-    changes = {f"disturbance.{name}": value for name, value in own.items()}
-    changes |= {"disturbance.push_interval": (0.04, 0.1), "env.observation": "deployable", "env.observation_history": 2}
-    return changes | {"command.kind": "velocity", "env.axes": "heading", "features.axes": "heading", "env.first_cap": 5}
 
 
 def test_the_actor_sees_sensors_and_the_critic_the_truth(played):

@@ -152,8 +152,9 @@ def progress_line(training: Clock, rows: Sequence[dict[str, float]]) -> str:
     losses = " ".join(
         f"{name} {m[f'fit/{name}_loss']:.2f}" for name in ("value", "endpoint", "flow") if f"fit/{name}_loss" in m
     )
+    unit, letter = (1e6, "M") if config.transitions >= 1e6 else (1e3, "k")
     return (
-        f"{training.transitions / 1e6:6.2f} of {config.transitions / 1e6:.2f} M | "
+        f"{training.transitions / unit:6.2f} of {config.transitions / unit:.2f} {letter} | "
         f"{len(rows) * training.rate:,.0f}/s, {clock(training.left)} left | "
         f"episode {m['train/episode_length']:.0f} of {m['env/cap']:.0f} steps, falls {100 * m['train/falls']:.0f} % | "
         f"speed {m['train/speed']:+.2f} m/s | reward spread {m['train/reward_spread']:.2f} | {losses}"

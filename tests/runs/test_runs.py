@@ -156,7 +156,7 @@ def test_the_progress_line_is_of_all_runs(time):
     }
     other = row | {"train/episode_length": float("nan"), "train/falls": 0.75}
     assert progress_line(clock, [row, other]) == (
-        "  0.00 of 0.00 M | 128/s, 0:06 left | episode 20 of 60 steps, falls 50 % | speed +0.50 m/s | "
+        "  0.26 of 0.64 k | 128/s, 0:06 left | episode 20 of 60 steps, falls 50 % | speed +0.50 m/s | "
         "reward spread 1.00 | value 2.00"
     )
 
