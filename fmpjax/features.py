@@ -119,6 +119,25 @@ def true_form(config: Config) -> str:
     return content if config.env.axes == "world" else f"{content} {config.env.axes}"
 
 
+def estimated_columns(robot: Robot, config: Config) -> list[int]:
+    """Where a critic observes what no sensor of a robot measures: its root's height and linear velocity."""
+    columns, start = [], 0
+    for name, width in observation_terms(robot, true_form(config)).items():
+        if name == "root_height" or name.endswith("_linear_velocity"):
+            columns += range(start, start + width)
+        start += width
+    return columns
+
+
+def newest_columns(robot: Robot, form: str) -> list[int]:
+    """Where an observation with a history holds its last step; nothing for one without a history."""
+    steps, columns, start = observation_history(form), [], 0
+    for width in observation_terms(robot, form).values():
+        columns += range(start + width - width // steps, start + width)
+        start += width
+    return columns if steps > 1 else []
+
+
 def _command_terms(form: str) -> dict[str, int]:
     """Names and widths of what a policy observes of its command."""
     content, *more = form.split()

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from fmpjax.trainer import Trainer
 
 LIVE = "live.npz"  # in a run's folder, its policy while it trains with --live
+LAYERED = ("kernels", "biases", "estimator_kernels", "estimator_biases")  # fields with an array for each layer
 _EXPECTED = "expected policy.npz as `fmpjax export` writes it"
 _ACTIVATIONS = {
     "relu": lambda x: np.maximum(x, 0.0),
@@ -41,6 +42,10 @@ class Policy(NamedTuple):
     scale: np.ndarray  # [J] rad, a unit of action
     low: np.ndarray  # [J] rad, of the targets
     high: np.ndarray  # [J] rad
+    # Of a network that estimates what the robot does not sense; the policy's first layer sees its output, too.
+    estimator_kernels: tuple[np.ndarray, ...] = ()
+    estimator_biases: tuple[np.ndarray, ...] = ()
+    inputs: np.ndarray = np.zeros(0, int)  # of the observation, what the first layer then sees; empty: all
 
     def __repr__(self) -> str:
         return (
@@ -62,10 +67,16 @@ class Policy(NamedTuple):
             )
         # In double precision: a robot gets the same targets alone and in a batch, whatever library multiplies.
         x = np.clip((np.float64(observation) - self.mean) / self.deviation, -self.clip, self.clip)
-        for kernel, bias in zip(self.kernels[:-1], self.biases[:-1], strict=True):
-            x = _ACTIVATIONS[self.activation](x @ kernel + bias)
-        action = x @ self.kernels[-1] + self.biases[-1]
+        if self.estimator_kernels:
+            estimate = self._network(x, self.estimator_kernels, self.estimator_biases)
+            x = np.concatenate([x[..., self.inputs] if self.inputs.size else x, estimate], axis=-1)
+        action = self._network(x, self.kernels, self.biases)
         return np.clip(self.center + self.scale * action, self.low, self.high)
+
+    def _network(self, x: np.ndarray, kernels: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...]) -> np.ndarray:
+        for kernel, bias in zip(kernels[:-1], biases[:-1], strict=True):
+            x = _ACTIVATIONS[self.activation](x @ kernel + bias)
+        return x @ kernels[-1] + biases[-1]
 
 
 def of(trainer: "Trainer", state: "PPOState") -> Policy:
@@ -74,6 +85,7 @@ def of(trainer: "Trainer", state: "PPOState") -> Policy:
 
     config, robot, actions = trainer.config, trainer.robot, trainer.env.actions
     kernels, biases = zip(*trainer.ppo.layers(state.actor), strict=True)
+    estimator = trainer.ppo.estimator_layers(state.actor)
     return Policy(
         joint_names=tuple(robot.joint_names),
         observation=trainer.env.form,
@@ -81,6 +93,9 @@ def of(trainer: "Trainer", state: "PPOState") -> Policy:
         activation=config.ppo.activation,
         kernels=kernels,
         biases=biases,
+        estimator_kernels=tuple(kernel for kernel, _ in estimator),
+        estimator_biases=tuple(bias for _, bias in estimator),
+        inputs=np.array(trainer.ppo.inputs, int),
         mean=np.asarray(of_actor(state.normalizer.mean)),
         deviation=np.asarray(of_actor(state.normalizer.std)),
         clip=float(config.ppo.normalizer_clip),
@@ -94,7 +109,7 @@ def save(path: Path, policy: Policy, metadata: Mapping[str, str] | None = None) 
     ``metadata`` is what `fmpjax.deploy.metadata` says of it, by which `fmpjax play` simulates its robot.
     """
     arrays = policy._asdict()
-    for name in ("kernels", "biases"):
+    for name in LAYERED:
         arrays |= {f"{name}.{i}": array for i, array in enumerate(arrays.pop(name))}
     if metadata is not None:
         arrays["metadata"] = json.dumps(dict(metadata))
@@ -130,8 +145,8 @@ def load(path: str | Path) -> Policy:
     try:
         with np.load(path) as file:
             arrays = {name: file[name] for name in file.files if name != "metadata"}
-        layers = range(sum(name.startswith("kernels.") for name in arrays))
-        for name in ("kernels", "biases"):
+        for name in LAYERED:
+            layers = range(sum(key.startswith(f"{name}.") for key in arrays))
             arrays[name] = tuple(arrays.pop(f"{name}.{i}") for i in layers)
         arrays |= {name: arrays[name].item() for name in ("observation", "rate", "activation", "clip")}
         arrays["joint_names"] = tuple(map(str, arrays["joint_names"]))

@@ -55,7 +55,8 @@ class Batch(NamedTuple):
 class Actor(linen.Module):
     """Mean and deviation ``[..., J]`` of the action distribution, of normalized observations ``[..., O]``.
 
-    The deviation is one learned number per joint, whatever is observed.
+    The deviation is one learned number per joint, whatever is observed. With an estimator the third output is what it
+    estimates, ``[..., E]``; the policy sees that, too, and does not train it.
     """
 
     size: int  # J
@@ -64,18 +65,28 @@ class Actor(linen.Module):
     kernel_init: learning.Initializer  # of the hidden layers
     mean_init: float  # bound of the last layer's weights
     deviation: float  # initial
+    estimator: Sequence[int] = ()  # hidden layers of the estimator
+    estimates: int = 0  # E
+    inputs: Sequence[int] = ()  # columns of the observation that the policy sees beside the estimates; none: all
 
     @linen.compact
     def __call__(self, x):
+        estimate = None
+        if self.estimates:
+            sensed = MLP(self.estimator, self.activation, self.kernel_init, activate_final=True, name=_ESTIMATOR)(x)
+            estimate = linen.Dense(self.estimates, name=_ESTIMATE)(sensed)
+            x = x[..., np.array(self.inputs)] if self.inputs else x
+            x = jnp.concatenate([x, jax.lax.stop_gradient(estimate)], axis=-1)
         x = MLP(self.hidden, self.activation, self.kernel_init, activate_final=True, name=_TRUNK)(x)
         mean = linen.Dense(self.size, kernel_init=learning.uniform(self.mean_init), name=_MEAN)(x)
         start = lambda key: {"log_value": jnp.full((self.size,), jnp.log(self.deviation))}  # noqa: E731
         deviation = jnp.exp(self.param(_DEVIATION, start)["log_value"])
-        return mean, jnp.broadcast_to(deviation, mean.shape)
+        return mean, jnp.broadcast_to(deviation, mean.shape), estimate
 
 
 # The actor's parameters; checkpoints hold these names.
 _TRUNK, _MEAN, _DEVIATION = "MLP_0", "Dense_0", "std_logparam"
+_ESTIMATOR, _ESTIMATE = "estimator", "estimate"
 
 
 class PPO:
@@ -88,6 +99,8 @@ class PPO:
       clock: steps of the longest episode, where the critic also observes the share of them that is over. A reward that
         depends on an episode's past needs it. 0 for a critic that observes what the policy does.
       mirror: of observations and actions, where the loss asks for a policy that does the same on both sides.
+      estimated: E columns of the critic's observation that the actor estimates, where the configuration asks for it.
+      inputs: columns of its own observation that the policy then sees beside the estimates; all for none.
     """
 
     def __init__(
@@ -97,14 +110,21 @@ class PPO:
         config: PPOConfig,
         clock: int = 0,
         mirror: Mirror | None = None,
+        estimated: Sequence[int] = (),
+        inputs: Sequence[int] = (),
     ):
         self.config, self.clock, self.mirror = config, clock, mirror
+        self.estimated = np.array(estimated if config.estimator else (), int)
+        self.inputs = tuple(inputs) if config.estimator else ()
         self.observation_size, self.action_size = observation_size, action_size
         activation, initializers = learning.activation(config.activation), jax.nn.initializers
         # Otherwise uniform within 1 / sqrt(inputs), PyTorch's way.
         uniform = initializers.variance_scaling(1 / 3, "fan_in", "uniform")
         kernel = initializers.orthogonal(2.0**0.5) if config.orthogonal else uniform
-        self._actor = Actor(action_size, config.hidden, activation, kernel, config.mean_init, config.deviation)
+        self._actor = Actor(
+            action_size, config.hidden, activation, kernel, config.mean_init, config.deviation,
+            config.estimator, len(self.estimated), self.inputs,
+        )  # fmt: skip
         self._critic = MLP((*config.hidden, 1), activation, kernel)
         self._distribution = distribution.NormalDistribution(action_size)
         clip = [optax.clip_by_global_norm(config.clip_norm)] if config.clip_norm else []
@@ -136,9 +156,13 @@ class PPO:
 
     def policy(self, actor, normalizer: RunningStatisticsState, observation: Any) -> tuple[jax.Array, jax.Array]:
         """Mean and deviation ``[..., J]`` of the action distribution."""
+        mean, deviation, _ = self._outputs(actor, normalizer, observation)
+        return mean, deviation
+
+    def _outputs(self, actor, normalizer: RunningStatisticsState, observation: Any):
         output: Any = self._actor.apply(actor, self._normalized(normalizer, observation, of_actor))
-        mean, deviation = output
-        return mean, deviation if self.config.learn_deviation else jax.lax.stop_gradient(deviation)
+        mean, deviation, estimate = output
+        return mean, deviation if self.config.learn_deviation else jax.lax.stop_gradient(deviation), estimate
 
     def act(self, state: PPOState, deterministic: bool = False) -> ActionRule:
         """The policy as the environment calls it."""
@@ -155,9 +179,11 @@ class PPO:
 
     def layers(self, actor) -> list[tuple[np.ndarray, np.ndarray]]:
         """Kernel ``[in, out]`` and bias ``[out]`` of each layer of the actor, the last of which gives the mean."""
-        parameters = actor["params"]
-        hidden = [parameters[_TRUNK][f"hidden_{i}"] for i in range(len(self.config.hidden))]
-        return [(np.asarray(layer["kernel"]), np.asarray(layer["bias"])) for layer in (*hidden, parameters[_MEAN])]
+        return _layers(actor["params"], _TRUNK, _MEAN)
+
+    def estimator_layers(self, actor) -> list[tuple[np.ndarray, np.ndarray]]:
+        """The same of the estimator, whose last layer gives what the first layer of the actor sees beside the rest."""
+        return _layers(actor["params"], _ESTIMATOR, _ESTIMATE) if self.estimated.size else []
 
     def value(self, state: PPOState, observation: Any, age: jax.Array | None = None) -> jax.Array:
         """Value estimates ``[...]`` after ``age [...]`` steps of an episode, which only a critic with a clock reads."""
@@ -208,7 +234,7 @@ class PPO:
 
         def actor_loss(params, sample):
             samples, _, gain = sample
-            mean, deviation = self.policy(params, state.normalizer, samples.observation)
+            mean, deviation, estimate = self._outputs(params, state.normalizer, samples.observation)
             new, old = (mean, deviation), (samples.mean, samples.deviation)
             log_ratio = self._distribution.log_prob(new, samples.action) - self._distribution.log_prob(
                 old, samples.action
@@ -229,6 +255,10 @@ class PPO:
                 other, _ = self.policy(params, state.normalizer, image)
                 off = jnp.mean(jnp.sum((other - self.mirror.action(mean)) ** 2, axis=-1))
                 loss, stats = loss + config.mirror * off, stats | {"asymmetry": off}
+            if self.estimated.size:
+                truth = self._normalized(state.normalizer, samples.observation, of_critic)[..., self.estimated]
+                error = (estimate - truth) ** 2
+                loss, stats = loss + 0.5 * jnp.mean(jnp.sum(error, axis=-1)), stats | {"estimate_error": error.mean()}
             return loss, stats
 
         actor, actor_optimizer, actor_stats = self._epochs(
@@ -261,8 +291,7 @@ class PPO:
             "advantage_deviation": spread,
             "explained_variance": 1.0 - jnp.mean((returns - value) ** 2) / jnp.maximum(return_variance, 1e-8),
         }
-        if self.mirror is not None:
-            metrics["asymmetry"] = actor_stats["asymmetry"]
+        metrics |= {name: actor_stats[name] for name in ("asymmetry", "estimate_error") if name in actor_stats}
         return new_state, metrics
 
     def _epochs(self, loss, params, optimizer_state, rate, flat, key, epochs: int, batch: int):
@@ -285,6 +314,13 @@ class PPO:
         summary = {name: values[-minibatches:].mean() for name, values in stats.items()}
         summary["skipped"] = stats["skipped"].sum()
         return params, optimizer_state, summary
+
+
+def _layers(parameters, trunk: str, last: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Kernel and bias of each hidden layer of ``trunk``, and of the layer ``last``."""
+    hidden = parameters[trunk]
+    layers = [*(hidden[f"hidden_{i}"] for i in range(len(hidden))), parameters[last]]
+    return [(np.asarray(layer["kernel"]), np.asarray(layer["bias"])) for layer in layers]
 
 
 def capped(statistics: RunningStatisticsState, most: int) -> RunningStatisticsState:

@@ -49,7 +49,9 @@ class Trainer:
         clock = config.env.longest_episode if priors.remembers(config.method) else 0
         form = features.observation_form(config)
         image = mirror.make(self.robot, form, self.env.actions) if config.ppo.mirror else None
-        self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo, clock, image)
+        estimated = features.estimated_columns(self.robot, config)
+        newest = features.newest_columns(self.robot, form)
+        self.ppo = PPO(self.env.observation_size, self.robot.joint_count, config.ppo, clock, image, estimated, newest)
         windows, share = self.env.clip_windows(), self.env.window_share()
         self.feature_map = features.fit_feature_map(self.robot, windows, config.features, share)
         self.expert = priors.Expert(

@@ -116,7 +116,9 @@ def small_policy(robot, walk, **changes):
     settings = tiny(**changes)
     form = features.observation_form(settings)
     size, random = sum(features.observation_terms(robot, form).values()), np.random.default_rng(0)
-    shapes = [(size, 16), (16, 12), (12, robot.joint_count)]
+    estimator = [(size, 8), (8, 4)] if settings.ppo.estimator else []
+    inputs = np.array(features.newest_columns(robot, form) if estimator else (), int)
+    shapes = [((inputs.size or size) + (4 if estimator else 0), 16), (16, 12), (12, robot.joint_count)]
     made = policy.Policy(
         joint_names=robot.joint_names,
         observation=form,
@@ -128,6 +130,9 @@ def small_policy(robot, walk, **changes):
         deviation=random.uniform(0.5, 2.0, size).astype(np.float32),
         clip=2.0,
         **{k: np.asarray(v, np.float32) for k, v in action_map(robot, walk, settings.env.action)._asdict().items()},
+        estimator_kernels=tuple(random.normal(0, shape[0] ** -0.5, shape).astype(np.float32) for shape in estimator),
+        estimator_biases=tuple(random.normal(0, 0.2, shape[1]).astype(np.float32) for shape in estimator),
+        inputs=inputs,
     )
     origin = deploy.Origin("run", settings, (("walk", 1.0), ("/mine/secret.csv", 0.5)), "abc123", None)
     return SimpleNamespace(config=settings, policy=made, origin=origin, size=size)

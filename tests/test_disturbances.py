@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fmpjax import disturbances, features, motion, physics, robots
+from fmpjax import disturbances, features, motion, physics, robots, rotations
 from fmpjax.acting import ActionRule, Seen
 from fmpjax.actions import action_map
 from fmpjax.config import DisturbanceConfig, preset
@@ -65,6 +65,23 @@ def test_pushes_without_a_speed_are_refused():
 def test_a_history_of_what_has_none_is_refused():
     with pytest.raises(UserError, match="observation_history is 3 and env.observation 'compact': expected 1"):
         preset("laptop", **{"env.observation_history": 3})
+
+
+@pytest.mark.parametrize("changes", [{}, {"env.observation": "deployable"}])
+def test_an_estimator_of_what_cannot_be_known_is_refused(changes):
+    with pytest.raises(UserError, match="ppo.estimator is 16: expected nothing unless env.observation is 'deployable'"):
+        preset("laptop", **{"ppo.estimator": (16,)}, **changes)
+
+
+def test_a_critic_sees_what_the_estimator_estimates(robot, walk):
+    config = preset("laptop", **{"env.observation": "deployable", "env.axes": "heading"})
+    qpos, qvel = (jnp.asarray(x[20:23], jnp.float32) for x in (walk.qpos, walk.qvel))
+    seen = features.observe(robot, qpos, qvel, features.true_form(config)).actor
+    columns = np.asarray(seen)[:, features.estimated_columns(robot, config)]
+    yaw = np.asarray(rotations.yaw(qpos[:, 3:7]))
+    ahead = np.cos(yaw) * qvel[:, 0] + np.sin(yaw) * qvel[:, 1]
+    aside = np.cos(yaw) * qvel[:, 1] - np.sin(yaw) * qvel[:, 0]
+    np.testing.assert_allclose(columns, np.stack([qpos[:, 2], ahead, aside, qvel[:, 2]], axis=-1), atol=1e-5)
 
 
 def test_a_torso_of_no_mass_is_refused(robot, walk):
@@ -279,6 +296,10 @@ def test_a_history_holds_each_terms_steps_oldest_first(robot, walk):
         np.testing.assert_allclose(seen[:, :9], expected)
     assert seen.shape[1] == 3 * (6 + 3 * joints) == sum(features.observation_terms(robot, made.form).values())
     np.testing.assert_allclose(seen[:, -joints:], 0)
+    single = built(robot, walk, **{"env.observation": "deployable"})
+    newest, _ = single.sense(single.init(jax.random.PRNGKey(0), COUNT), moved, (), drawn)
+    np.testing.assert_array_equal(seen[:, features.newest_columns(robot, made.form)], newest)
+    assert not features.newest_columns(robot, single.form)
 
 
 # --- in the environment ----------------------------------------------------------------------------------------------

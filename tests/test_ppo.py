@@ -450,6 +450,30 @@ def test_each_network_sees_its_own_part():
     np.testing.assert_array_equal(ppo.value(state, seen.critic), value)
 
 
+def test_the_estimator_learns_what_only_the_critic_sees():
+    """It follows from what the actor observes. The policy reads the estimate and does not train it."""
+    config = dataclasses.replace(PROBE, estimator=(32,), normalizer_count=0)
+    ppo = PPO(Seen(2, 4), 1, config, estimated=[2, 3])
+    rng = np.random.default_rng(0)
+    seen = rng.normal(size=(STEPS, COUNT, 2))
+    truth = np.stack([seen[..., 0] * seen[..., 1], 3.0 + seen[..., 0]], axis=-1)
+    observation = Seen(jnp.asarray(seen), jnp.asarray(np.concatenate([seen, truth], axis=-1)))
+
+    def update(state, key):
+        action, extras = ppo.act(state)(observation.actor, key)
+        batch = Batch(observation, observation, action, extras["mean"], extras["deviation"], ZEROS, NO, NO)
+        return ppo.update(state, batch, key)
+
+    start = ppo.init(jax.random.PRNGKey(0), observation)
+    assert start.actor["params"]["MLP_0"]["hidden_0"]["kernel"].shape == (4, 32)
+    state, metrics = jax.lax.scan(update, start, jax.random.split(jax.random.PRNGKey(1), 120))
+    assert metrics["estimate_error"][0] > 0.5 and metrics["estimate_error"][-1] < 0.02
+    gradient = jax.grad(lambda actor: ppo.policy(actor, state.normalizer, observation)[0].sum())(state.actor)["params"]
+    assert not any(leaf.any() for name in ("estimator", "estimate") for leaf in jax.tree.leaves(gradient[name]))
+    assert gradient["MLP_0"]["hidden_0"]["kernel"][2:].any()  # what the estimates are multiplied by
+    assert [kernel.shape for kernel, _ in ppo.estimator_layers(state.actor)] == [(2, 32), (32, 2)]
+
+
 def test_both_parts_have_running_statistics_that_may_forget():
     ppo = PPO(Seen(2, 3), 1, dataclasses.replace(PROBE, normalizer_count=10))
     seen = Seen(jax.random.normal(jax.random.PRNGKey(0), (5, 8, 2)), 7.0 + jnp.zeros((5, 8, 3)))

@@ -202,6 +202,8 @@ class PPOConfig(Section):
 
     rollout_steps: PositiveInt = 32  # control steps per rollout [P]
     hidden: Widths = (1024, 512)  # units of the hidden layers of actor and critic, which are separate networks [M]
+    # hidden layers of a network that estimates the root's height and velocity for an actor that cannot observe them [D]
+    estimator: tuple[PositiveInt, ...] = ()
     activation: Literal["relu", "elu", "swish", "tanh"] = "relu"  # activation of the hidden layers [M]
     mean_init: NonNegativeFloat = 0.01  # the weights of the actor's last layer start uniform up to this magnitude [M]
     orthogonal: bool = False  # orthogonal initial weights instead of uniform ones within 1 / sqrt(inputs) [M: no]
@@ -312,6 +314,12 @@ class Config(Section):
             raise UserError(
                 f"method is {self.method!r} and command.kind {self.command.kind!r}: expected 'phase', since "
                 f"{self.method} compares each step with the demonstration at the commanded time"
+            )
+        if self.ppo.estimator and (self.env.observation, self.env.axes) != ("deployable", "heading"):
+            raise UserError(
+                f"setting ppo.estimator is {', '.join(map(str, self.ppo.estimator))}: expected nothing unless "
+                f"env.observation is 'deployable' and env.axes 'heading' (now {self.env.observation!r} and "
+                f"{self.env.axes!r}), for it estimates a velocity in heading axes that this observation leaves out"
             )
         longest = self.env.longest_episode
         if self.method == "pwil" and self.pwil.slack * longest >= 1:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from fmpjax import cli, config, deploy, disturbances, features, physics, policy, resources, robots, runs
+from fmpjax.acting import Seen
 from fmpjax.commands import velocity
 from fmpjax.config import preset
 from fmpjax.env import action_map
@@ -70,22 +71,43 @@ def test_onnxruntime_says_what_numpy_says(tmp_path, robot, walk, observation, ac
     assert f"`obs` has {made.size} numbers" in card.read_text()
 
 
+ESTIMATED = {"env.observation": "deployable", "env.axes": "heading", "ppo.estimator": (8,)}
+
+
 @needs_onnx
-def test_onnxruntime_says_what_the_networks_say(tmp_path, robot, walk):
-    made = small(robot, walk, **{"ppo.hidden": (16, 12), "ppo.mean_init": 0.3})
-    ppo = PPO(made.size, robot.joint_count, made.config.ppo)
+@pytest.mark.parametrize("history", [1, 3])
+def test_an_estimator_is_inside_the_file(tmp_path, robot, walk, history):
+    made = small(robot, walk, **ESTIMATED, **{"env.observation_history": history})
+    assert made.size == history * 93 and made.policy.kernels[0].shape[0] == 97
+    observations = np.random.default_rng(1).normal(0, 3, (20, made.size)).astype(np.float32)
+    by_onnx, _ = targets(deploy.write(tmp_path, made.policy, robot, made.origin)[0], observations)
+    np.testing.assert_allclose(by_onnx, made.policy(observations), atol=1e-5)
+    deaf = made.policy._replace(estimator_biases=tuple(0 * bias for bias in made.policy.estimator_biases))
+    assert np.abs(deaf(observations) - by_onnx).max() > 1e-3
+    policy.save(tmp_path / "policy.npz", made.policy)
+    loaded = policy.load(tmp_path / "policy.npz")
+    np.testing.assert_array_equal(loaded(observations), made.policy(observations))
+
+
+@needs_onnx
+@pytest.mark.parametrize("estimated", [False, True])
+def test_onnxruntime_says_what_the_networks_say(tmp_path, robot, walk, estimated):
+    made = small(robot, walk, **{"ppo.hidden": (16, 12), "ppo.mean_init": 0.3} | (ESTIMATED if estimated else {}))
+    size = Seen(made.size, 20) if estimated else made.size
+    ppo = PPO(size, robot.joint_count, made.config.ppo, estimated=range(4), inputs=range(5, 30))
     seen = np.random.default_rng(0).normal(0.3, 2.0, (64, made.size)).astype(np.float32)
+    seen = Seen(jnp.asarray(seen), jnp.asarray(seen[:, :20])) if estimated else jnp.asarray(seen)
 
     @jax.jit  # each operation alone takes longer to compile
     def network(observations):
         state = ppo.init(jax.random.PRNGKey(0))
-        state = state._replace(normalizer=ppo.observe(state.normalizer, jnp.asarray(seen)))
+        state = state._replace(normalizer=ppo.observe(state.normalizer, seen))
         return state, ppo.act(state, deterministic=True)(observations, jax.random.PRNGKey(0))[0]
 
     observations = np.random.default_rng(1).normal(0, 3, (20, made.size)).astype(np.float32)
     state, wanted = network(observations)
     actions = action_map(robot, walk, made.config.env.action)
-    env = SimpleNamespace(actions=actions, form="compact")
+    env = SimpleNamespace(actions=actions, form="deployable" if estimated else "compact")
     trainer = SimpleNamespace(config=made.config, robot=robot, ppo=ppo, env=env)
     taken = policy.of(trainer, state)
     by_onnx, given = targets(deploy.write(tmp_path, taken, robot, made.origin)[0], observations)
@@ -203,6 +225,13 @@ def test_widths_that_do_not_fit_are_refused(robot, walk, change, sentence):
     made = small(robot, walk).policy
     made = made._replace(**change(made))
     with pytest.raises(UserError, match=sentence):
+        deploy.check_widths(made, features.observation_terms(robot, made.observation))
+
+
+def test_an_estimator_of_another_width_is_refused(robot, walk):
+    made = small(robot, walk, **ESTIMATED).policy
+    made = made._replace(estimator_kernels=(made.estimator_kernels[0], made.estimator_kernels[1][:, 1:]))
+    with pytest.raises(UserError, match="input of layer 0 has 97 numbers: expected 96"):
         deploy.check_widths(made, features.observation_terms(robot, made.observation))
 
 
