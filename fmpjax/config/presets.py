@@ -145,8 +145,10 @@ _ROBUST: dict[str, Any] = _LAPTOP | {
     "disturbance.push_lift": 0.4,  # mjlab's
     "disturbance.push_tilt": 0.52,  # mjlab's
     "disturbance.push_turn": 0.78,  # mjlab's
-    "disturbance.push_start": 0.3,  # a policy that cannot walk learns nothing of a large push
-    "disturbance.push_growth": 0.005,  # to full size in 140 rollouts that most episodes survive
+    "ppo.mirror": 1.0,  # a push comes from either side
+    "ppo.estimator": (128, 64),  # a push is a velocity, which no sensor measures
+    "ppo.discount": 0.985,  # a recovery takes a second
+    "ppo.gae_lambda": 0.95,  # as the discount
 }
 
 # What goes with a command unless it is set otherwise: neither the policy nor the prior knows which way is north.
