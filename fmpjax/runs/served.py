@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fmpjax import deploy, features, machine, policy
+from fmpjax.acting import Seen
 from fmpjax.errors import UserError
 from fmpjax.runs.folder import Run
 from fmpjax.runs.outputs import origin_of
@@ -50,7 +51,11 @@ class Served:
         trainer, checkpoints = self.run.trainer(), self.run.checkpoints
         parts = {name: checkpoints.part(f"ppo.{name}", iteration, best=best) for name in ("actor", "normalizer")}
         # The networks alone: a checkpoint may come from a program whose state had other parts.
-        state: Any = SimpleNamespace(actor=parts["actor"], normalizer=SimpleNamespace(**parts["normalizer"]))
+        spread = {
+            name: Seen(**kept) if isinstance(kept := parts["normalizer"][name], dict) else kept
+            for name in ("mean", "std")
+        }
+        state: Any = SimpleNamespace(actor=parts["actor"], normalizer=SimpleNamespace(**spread))
         learned = policy.of(trainer, state)
         if self._said is None:
             self._said = deploy.metadata(learned, trainer.robot, origin_of(self.run))

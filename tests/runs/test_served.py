@@ -16,7 +16,7 @@ from fmpjax.errors import UserError
 from fmpjax.play.reader import Reader
 from fmpjax.play.source import read_npz
 from fmpjax.runs import Run, served
-from tests.helpers import tiny
+from tests.helpers import disturbed, tiny
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +45,18 @@ def test_a_checkpoint_gives_a_policy_that_says_what_its_robot_is(run, tmp_path):
     assert played.robot == "unitree_g1" and span[1, 0] > 0.8
     np.testing.assert_allclose(played.commands, span)
     sim2sim.Simulation(played, run.trainer().robot.path, model=run.trainer().robot.model)
+
+
+def test_a_policy_that_senses_like_a_robot_is_that_of_the_state(tmp_path):
+    """Its critic sees more, so its statistics have two parts, and its estimator is a network of its own."""
+    made = Run.create(tmp_path / "run", disturbed(motion="walk", **{"ppo.estimator": (8,)}))
+    trainer = made.trainer()
+    state = trainer.init()
+    made.checkpoints.save(state)
+    given, wanted = policy.load(served.Served(made, tmp_path).policy(0, False)), policy.of(trainer, state.ppo)
+    observations = np.random.default_rng(0).normal(size=(3, len(wanted.mean)))
+    assert given.estimator_kernels and given.inputs.size == len(wanted.mean) // 2
+    np.testing.assert_array_equal(given(observations), wanted(observations))
 
 
 def test_the_prior_scores_as_in_training(run, tmp_path, states):
