@@ -52,12 +52,8 @@ def graph(policy: Policy):
 
     nodes, constants = [], []
 
-    def constant(name: str, value: np.ndarray | float) -> str:
-        constants.append(numpy_helper.from_array(np.asarray(value, np.float32), name))
-        return name
-
-    def integers(name: str, value: np.ndarray) -> str:
-        constants.append(numpy_helper.from_array(np.asarray(value, np.int64), name))
+    def constant(name: str, value: np.ndarray | float, kind: type = np.float32) -> str:
+        constants.append(numpy_helper.from_array(np.asarray(value, kind), name))
         return name
 
     def apply(kind: str, name: str, *inputs: str, **attributes) -> str:
@@ -80,7 +76,7 @@ def graph(policy: Policy):
     if policy.estimator_kernels:
         estimate = network(x, policy.estimator_kernels, policy.estimator_biases, "estimator_")
         if policy.inputs.size:
-            x = apply("Gather", "newest", x, integers("inputs", policy.inputs), axis=1)
+            x = apply("Gather", "newest", x, constant("inputs", policy.inputs, np.int64), axis=1)
         x = apply("Concat", "informed", x, estimate, axis=1)
     x = network(x, policy.kernels, policy.biases)
     # The limits of the joint targets, in units of action: a runner that knows no limits keeps them all the same.
