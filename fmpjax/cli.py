@@ -117,6 +117,8 @@ class Render:
     """Leave the demonstration out; its license may forbid sharing pictures of it."""
     course: Annotated[tuple[str, ...], default("none")] = ()
     """Commands for a policy with velocity commands: SECONDS:FORWARD,LEFT,TURN (m/s, rad/s), such as 4:0.5,0,0.4."""
+    push: Annotated[float | None, default("none")] = None
+    """Film four episodes with a push of this speed, m/s, every 2 s in any direction."""
 
     def __call__(self) -> None:
         runs = runs_module()
@@ -124,9 +126,16 @@ class Render:
 
         if not 0 < self.seconds < math.inf:
             raise UserError(f"--seconds is {self.seconds:g}: expected a number above 0")
+        if self.push is not None and not 0 < self.push < math.inf:
+            raise UserError(f"--push is {self.push:g}: expected a speed above 0, in m/s")
+        if self.push is not None and self.course:
+            raise UserError("--push and --course were both given: expected one of them")
         run = runs.Run.open(self.run)
         trainer, state = run.policy(best=not self.last)
         print("rolling out and rendering ...", flush=True)
+        if self.push is not None:
+            print(f"wrote {runs.pushed_video(run, trainer, state, self.push, self.out, self.seconds)}")
+            return
         if self.course:
             from fmpjax import sim2sim
 

@@ -113,12 +113,10 @@ class Disturbances:
         """What a control step of the physics takes, ``(state, targets[, traits])``, and the disturbances after it."""
         episode, sizes = state.episode, state.sizes
         if self.config.push_interval:
-            now = episode.wait <= 1
             first, last = sizes.interval.T
             wait = jnp.round(first + drawn[:, _PUSH] * (last - first)).astype(jnp.int32)
-            push = state.share[:, None] * _push(sizes, drawn)
-            sim = sim._replace(qvel=sim.qvel.at[:, :6].add(jnp.where(now[:, None], push, 0.0)))
-            episode = episode._replace(wait=jnp.where(now, wait, episode.wait - 1))
+            sim = sim._replace(qvel=sim.qvel.at[:, :6].add(self.push(state, drawn)))
+            episode = episode._replace(wait=jnp.where(episode.wait <= 1, wait, episode.wait - 1))
         sent = jnp.concatenate([episode.sent, self.actions.clipped(action)[:, None]], axis=1)
         episode = episode._replace(sent=sent[:, 1:])
         if self.config.delay:
@@ -128,6 +126,11 @@ class Disturbances:
         if self.config.encoder_bias:  # servos hold what the encoders say
             targets -= state.bias[:, None] if targets.ndim == 3 else state.bias
         return (sim, targets, *((state.body,) if self.config.bodies else ())), state._replace(episode=episode)
+
+    def push(self, state: State, drawn: jax.Array) -> jax.Array:
+        """What a push of the next step adds to the root's velocity, ``[N, 6]``, zero where there is none."""
+        push = state.share[:, None] * _push(state.sizes, drawn)
+        return jnp.where((state.episode.wait <= 1)[:, None], push, 0.0)
 
     def sense(self, state: State, sim: PhysicsState, told: Any, drawn: jax.Array) -> tuple[jax.Array, State]:
         """The actor's observation ``[N, O]`` of states whose command is ``told [N, C]``, and what is now remembered."""

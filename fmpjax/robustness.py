@@ -100,11 +100,11 @@ def cases(config: Config) -> list[Case]:
         ],
         "slope": [(f"to {v:g} rad", {"slope": v}) for v in (0.03, 0.06, 0.12)],
     }
-    pushed: dict[str, Any] = {"push_interval": (EVERY, EVERY)}
+    every: dict[str, Any] = {"push_interval": (EVERY, EVERY)}
     found = [Case("none", "", DisturbanceConfig())]
     for name, sizes in alone.items():
         found += [
-            Case(name, size, DisturbanceConfig(**(pushed if "push" in name else {}) | changes))
+            Case(name, size, DisturbanceConfig(**(every if "push" in name else {}) | changes))
             for size, changes in sizes
         ]
     peers = dataclasses.replace(
@@ -119,6 +119,11 @@ def cases(config: Config) -> list[Case]:
     return [*found, Case("together", "mjlab's", MJLAB), Case("together", "all peers'", peers)]
 
 
+def pushed(speed: float) -> DisturbanceConfig:
+    """Pushes of one size, m/s, in any direction, as in the cases of pushes alone."""
+    return DisturbanceConfig(push_interval=(EVERY, EVERY), push_speed=(speed, speed))
+
+
 class _Second(NamedTuple):
     """Episodes under way."""
 
@@ -126,6 +131,15 @@ class _Second(NamedTuple):
     alive: jax.Array  # [N] bool
     fell: jax.Array  # [N] bool
     length: jax.Array  # [N] int32
+
+
+class Played(NamedTuple):
+    """First episodes of N environments over T steps; after a fall the state stands still."""
+
+    qpos: np.ndarray  # [T, N, 7 + J]
+    length: np.ndarray  # [N] steps survived
+    fell: np.ndarray  # [N] bool
+    pushes: np.ndarray  # [T, N, 6] what was added to the root's velocity before each step, mostly zero
 
 
 class Player:
@@ -148,39 +162,45 @@ class Player:
         everything = dataclasses.replace(config, disturbance=everything, physics=settings)
         backend = physics.make(trainer.robot, settings, joint_friction=True)
         self.env = Env(trainer.robot, trainer.library, everything, backend)
+        assert self.env.disturbances is not None, "the evaluation's own configuration has every disturbance"
+        self.disturbances = self.env.disturbances
         self.noise = next(iter(episodes_of(config, episodes)))
         self._key = jax.random.PRNGKey(seed)
         rows = self.env.reset_rows(self._key, episodes)
         self._start = self.env.start_at(rows, jax.random.fold_in(self._key, 2), jnp.full(episodes, self.noise))
         self.chunk = round(config.control_rate)
 
-    def play(self, state: PPOState, config: DisturbanceConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Episodes under the mean action: ``qpos [T, N, 7 + J]``, lengths ``[N]`` in steps, and falls ``[N]``."""
-        assert self.env.disturbances is not None, "the evaluation's own configuration has every disturbance"
-        disturbed = self.env.disturbances.init(jax.random.fold_in(self._key, 3), self.count, config)
+    def play(self, state: PPOState, config: DisturbanceConfig) -> Played:
+        """Play episodes under the mean action and disturbances of these sizes."""
+        disturbed = self.disturbances.init(jax.random.fold_in(self._key, 3), self.count, config)
         disturbed = disturbed._replace(share=jnp.ones_like(disturbed.share))
         alive = jnp.ones(self.count, bool)
         under_way = _Second(self._start._replace(disturbed=disturbed), alive, ~alive, jnp.zeros(self.count, jnp.int32))
         steps, recorded = self.env.config.episode_steps, []
         for i in range(-(-steps // self.chunk)):
-            under_way, qpos = self._second(state, under_way, jax.random.fold_in(self._key, 100 + i))
-            recorded.append(np.asarray(qpos))
+            under_way, second = self._second(state, under_way, jax.random.fold_in(self._key, 100 + i))
+            recorded.append(jax.tree.map(np.asarray, second))
             if not np.asarray(under_way.alive).any():
                 break
-        qpos = np.concatenate(recorded)[:steps]
+        qpos, pushes = (np.concatenate(part)[:steps] for part in zip(*recorded, strict=True))
         # An episode of the longest length may have ended within the last chunk, past its end.
         length = np.minimum(np.asarray(under_way.length), steps)
         fell = np.asarray(under_way.fell) & (np.asarray(under_way.length) <= steps)
-        return np.concatenate([qpos, np.repeat(qpos[-1:], steps - len(qpos), axis=0)]), length, fell
+        rest = steps - len(qpos)
+        qpos = np.concatenate([qpos, np.repeat(qpos[-1:], rest, axis=0)])
+        return Played(
+            qpos, length, fell, np.concatenate([pushes, np.zeros_like(pushes, shape=(rest, *pushes.shape[1:]))])
+        )
 
     @partial(jax.jit, static_argnums=0)
     def _second(self, state: PPOState, under_way: _Second, key: jax.Array):
         env, policy = self.env, self.trainer.ppo.act(state, deterministic=True)
 
         def step(carry, drawn):
+            pushes = jnp.where(carry.alive[:, None], self.disturbances.push(carry.now.disturbed, drawn), 0.0)
             taken = frozen.step(self.trainer, env, policy, carry.now, carry.alive, drawn)
             after = _Second(taken.now, taken.alive, carry.fell | taken.fell, carry.length + carry.alive)
-            return after, taken.now.physics.qpos
+            return after, (taken.now.physics.qpos, pushes)
 
         return jax.lax.scan(step, under_way, env.disturbance_draws(key, self.chunk, self.count))
 
@@ -199,15 +219,16 @@ def measure(trainer: Trainer, state: PPOState, *, episodes: int = EPISODES, note
     """
     player, cells = Player(trainer, episodes), []
     for case in cases(trainer.config):
-        cells.append(_cell(trainer, case, *player.play(state, case.config)))
+        cells.append(_cell(trainer, case, player.play(state, case.config)))
         if note:
             note(table(cells[-1:]))
     speed = float(trainer.library.mean([planar_speed(clip) for clip in trainer.library.clips]))
     return Robustness(tuple(cells), trainer.config.env.episode_steps / trainer.config.control_rate, speed)
 
 
-def _cell(trainer: Trainer, case: Case, qpos: np.ndarray, length: np.ndarray, fell: np.ndarray) -> Cell:
+def _cell(trainer: Trainer, case: Case, played: Played) -> Cell:
     rate, robot = trainer.config.control_rate, trainer.robot
+    qpos, length, fell, _ = played
     low, high = wilson(int(fell.sum()), len(fell))
     speeds, _ = metrics.late_path(qpos[..., :3], rotations.yaw(qpos[..., 3:7].astype(np.float64)), length, rate=rate)
     expert = trainer.library.mean(

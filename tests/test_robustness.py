@@ -58,15 +58,23 @@ def test_any_policy_is_played_under_any_disturbance(walk, name):
     state, programs = trainer.init(0).ppo, robustness.Player._second._cache_size()
     calm = player.play(state, DisturbanceConfig())
     steps = trainer.config.env.episode_steps
-    assert calm[0].shape == (steps, 6, 7 + trainer.robot.joint_count)
-    assert (calm[1] <= steps).all() and ((calm[1] == steps) | calm[2]).all()
+    assert calm.qpos.shape == (steps, 6, 7 + trainer.robot.joint_count)
+    assert (calm.length <= steps).all() and ((calm.length == steps) | calm.fell).all()
+    assert calm.pushes.shape == (steps, 6, 6) and not calm.pushes.any()
     again = player.play(state, DisturbanceConfig())
     for a, b in zip(calm, again, strict=True):
         np.testing.assert_array_equal(a, b)
     for case in robustness.cases(trainer.config)[1::3]:
-        qpos, *_ = player.play(state, case.config)
+        played = player.play(state, case.config)
         # Torques of a policy that has learned nothing may stay below any limit.
-        assert case.disturbance == "motor strength" or np.abs(qpos - calm[0]).max() > 1e-6, case
+        assert case.disturbance == "motor strength" or np.abs(played.qpos - calm.qpos).max() > 1e-6, case
+        if case.size == "0.25 m/s":
+            sizes = np.linalg.norm(played.pushes, axis=-1)
+            np.testing.assert_allclose(sizes[sizes > 0], 0.25, rtol=1e-5)
+            # A push every two seconds, the first one at any time of the first two, none after the end.
+            limit = np.ceil((played.length / trainer.config.control_rate + robustness.EVERY) / robustness.EVERY)
+            assert ((sizes > 0).sum(axis=0) <= limit).all() and sizes.any()
+            assert all(not sizes[end:, i].any() for i, end in enumerate(played.length))
     assert robustness.Player._second._cache_size() == programs + 1, "one program serves all cases"
 
 
@@ -75,6 +83,11 @@ def test_the_command_writes_figures_and_a_picture(tmp_path, monkeypatch, capsys)
     monkeypatch.setattr(robustness, "cases", lambda config: robustness_cases(config)[:2])
     run = runs.Run.create(tmp_path / "run", tiny())
     runs.train(run)
+    cli.main(["render", str(run.folder), "--push", "0.5", "--seconds", "0.3"])
+    assert "pushed." in capsys.readouterr().out and list(run.folder.glob("pushed.*"))[0].stat().st_size > 1000
+    with pytest.raises(SystemExit):
+        cli.main(["render", str(run.folder), "--push", "-1"])
+    assert "--push is -1: expected a speed above 0" in capsys.readouterr().err
     cli.main(["evaluate", str(run.folder), "--robust", "--episodes", "4"])
     figures = json.loads((run.folder / "robustness.json").read_text())
     assert [cell["disturbance"] for cell in figures["cells"]] == ["none", "push"]

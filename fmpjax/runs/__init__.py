@@ -4,8 +4,9 @@ from fmpjax.files import without_places, write
 from fmpjax.provenance import machine, provenance
 from fmpjax.runs import pretraining
 from fmpjax.runs.clock import End
+from fmpjax.runs.films import course_video, pushed_video, video
 from fmpjax.runs.folder import Run, check_trainable, default_folder, default_preset, describe, load_motion
-from fmpjax.runs.outputs import course_video, export, finish, video, web
+from fmpjax.runs.outputs import export, finish, web
 from fmpjax.runs.served import Live
 from fmpjax.runs.training import train
 
@@ -24,6 +25,7 @@ __all__ = [
     "machine",
     "pretraining",
     "provenance",
+    "pushed_video",
     "train",
     "video",
     "web",

@@ -1,30 +1,30 @@
-"""What a run leaves to look at and to take away: evaluation, curves, pictures, a film, policy files."""
+"""What a finished run leaves: evaluation, pictures, policy files."""
 
 import json
 import shutil
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
-from fmpjax import deploy, diagnose, jsons, policy, steering
+from fmpjax import deploy, diagnose, jsons, policy
 from fmpjax.commands import velocity
 from fmpjax.errors import UserError
 from fmpjax.evaluate import Episodes, table
 from fmpjax.files import without_places, write
 from fmpjax.logs import MetricsLog
 from fmpjax.motion import addresses
+from fmpjax.runs.films import longest, video
 from fmpjax.runs.folder import Run
-from fmpjax.trainer import Trainer, TrainState
+from fmpjax.trainer import Trainer
 from fmpjax.viz import curves, render
 
 _EXPORTED = (
     "metrics.csv evaluation.json steering.json following.json performing.json robustness.json "
     "ranking-start.json ranking.json "
-    "curves.png steering.png following.png performing.png robustness.png frames.png policy.mp4 policy.gif course.mp4"
+    "curves.png steering.png following.png performing.png robustness.png frames.png policy.mp4 policy.gif "
+    "course.mp4 pushed.mp4"
 ).split()
 
 
@@ -164,84 +164,9 @@ def _commands(run: Run) -> dict[str, tuple[float, float]] | None:
     return {name: (float(low[i]), float(high[i])) for i, name in enumerate(names)}
 
 
-def video(
-    run: Run,
-    trainer: Trainer,
-    played: Episodes,
-    *,
-    seconds: float = 10.0,
-    path: Path | None = None,
-    alone: bool = False,
-    smooth: bool = True,
-) -> Path:
-    """The policy beside the demonstration, or alone, as a video; the path written.
-
-    It lasts ``seconds``, or until one second after the fall of a policy that falls before.
-    """
-    rate = trainer.config.control_rate
-    stride = 2  # 25 pictures a second
-    episode = _longest(played)
-    length = int(played.length[episode])
-    last = min(int(seconds * rate), len(played.qpos), length + int(rate))
-    shown = {"policy": played.qpos[: min(last, length) : stride, episode]}
-    if not alone:
-        shown["demonstration"] = trainer.library.clips[played.clip[episode]].qpos[:last:stride]
-    panes = len(shown)
-    motions, labels = list(shown.values()), list(shown)
-    frames = render.grid(trainer.robot, motions, labels, columns=panes, width=360 * panes, height=360, smooth=smooth)
-    return render.write_video(path or run.folder / "policy.mp4", frames, fps=rate / stride)
-
-
-def course_video(
-    run: Run,
-    trainer: Trainer,
-    state: TrainState,
-    course: Sequence[tuple[float, tuple[float, float, float]]],
-    path: Path | None,
-) -> Path:
-    """The policy under a course of commanded velocities, which the picture shows; the path written.
-
-    Args:
-      run: whose command is a velocity.
-      trainer: of the run.
-      state: of the policy.
-      course: seconds and velocity (m/s ahead, m/s to the left, rad/s to the left) of each leg.
-      path: of the video, ``RUN/course.mp4`` by default.
-
-    Raises:
-      UserError: the run's command is no velocity, or the file cannot be written.
-    """
-    trainer.config.command.require("velocity")
-    rate, stride = trainer.config.control_rate, 2  # 25 pictures a second
-    told = np.concatenate([np.tile(command, (max(1, round(seconds * rate)), 1)) for seconds, command in course])
-    played = steering.play(trainer, state.ppo, told[:, None], np.random.default_rng(0))
-    # A stride swings the velocity: what is shown is a mean over half a second.
-    shown = uniform_filter1d(played.velocity[:, 0], round(0.5 * rate), axis=0, mode="nearest")
-    length = max(1, int(played.alive[:, 0].sum()))
-    labels = [_told(*pair, aside=bool(told[:, 1].any())) for pair in zip(told, shown, strict=True)]
-    frames = render.render_frames(
-        trainer.robot, played.qpos[:length:stride, 0], width=640, height=400, labels=labels[:length:stride]
-    )
-    return render.write_video(path or run.folder / "course.mp4", frames, fps=rate / stride)
-
-
-def _told(told: np.ndarray, does: np.ndarray, *, aside: bool) -> str:
-    """A commanded velocity and the robot's, each ``[3]``, in words; the part to the side where any is commanded."""
-    (ahead, left, turn), (ahead_now, left_now, turn_now) = told, does
-    if aside:
-        now = f"{ahead_now:.2f}, {left_now:+.2f}, {turn_now:+.2f}"
-        return f"told {ahead:.2f}, {left:+.2f} m/s, {turn:+.2f} rad/s   does {now}"
-    return f"told {ahead:.2f} m/s, {turn:+.2f} rad/s   does {ahead_now:.2f}, {turn_now:+.2f}"
-
-
-def _longest(played: Episodes) -> int:
-    """The longest episode, which shows most; ties go to the first."""
-    return int(np.argmax(played.length))
-
-
 def _stride_frames(trainer: Trainer, played: Episodes) -> np.ndarray:
     """Twelve pictures of one second of the policy, from the late part of its longest episode."""
-    episode = _longest(played)
+    episode = longest(played)
     length = int(played.length[episode])
     last = min(length - 1, int(0.7 * len(played.qpos)))
     rows = np.linspace(max(0, last - int(trainer.config.control_rate)), last, 12).astype(int)

@@ -93,7 +93,7 @@ def _draw(draw, robot: Robot, motions, captions, follow: bool, frames: np.ndarra
 def grid(
     robot: Robot,
     motions: Sequence[np.ndarray],
-    labels: Sequence[str],
+    labels: Sequence[str | Sequence[str]],
     *,
     columns: int = 3,
     width: int = 960,
@@ -106,7 +106,7 @@ def grid(
     Args:
       robot: the robot.
       motions: ``[T, 7 + J]`` each.
-      labels: one for each motion.
+      labels: one for each motion, or one for each of its frames.
       columns: panes in a row.
       width: pixels, of all panes together.
       height: pixels, of all panes together.
