@@ -157,6 +157,8 @@ class Export:
     """Also write policy.onnx and MODEL_CARD.md, for other programs; docs/deploy.md."""
     web: Annotated[Path | None, default("no page")] = None
     """New folder for a page on which the policy runs in a browser; nothing else is written unless asked for."""
+    last: bool = False
+    """Take the newest checkpoint instead of the best, with the figures of `fmpjax evaluate --last`."""
 
     def __call__(self) -> None:
         runs = runs_module()
@@ -164,10 +166,10 @@ class Export:
 
         run = runs.Run.open(self.run)
         if self.web is None or self.onnx or self.out is not None:
-            for path in runs.export(run, self.out or run.folder / "export", onnx=self.onnx):
+            for path in runs.export(run, self.out or run.folder / "export", onnx=self.onnx, best=not self.last):
                 print(f"wrote {path}")
         if self.web is not None:
-            runs.web(run, self.web)
+            runs.web(run, self.web, best=not self.last)
             print(f"wrote {self.web}, a page: see it with `python -m http.server --directory {self.web}`")
         config = run.config
         for say in (deploy.unmeasured, deploy.no_stock) if self.onnx else ():

@@ -202,6 +202,20 @@ def test_an_export_carries_the_best_policy(trained, tmp_path):
 
 
 @pytest.mark.slow
+def test_an_export_carries_the_newest_policy_with_its_own_figures(trained, tmp_path):
+    run = runs.Run.open(shutil.copytree(trained, tmp_path / "run"))
+    (run.folder / "evaluation-last.json").write_text(json.dumps({"falls": 3}))
+    cli.main(["export", str(run.folder), str(tmp_path / "out"), "--last"])
+    trainer, state = run.policy(best=False)
+    observations = trainer.env.clip_observations[:5]
+    actions, _ = trainer.ppo.act(state.ppo, deterministic=True)(observations, None)
+    loaded = policy.load(tmp_path / "out" / "policy.npz")
+    np.testing.assert_allclose(loaded(observations), trainer.env.actions(actions), atol=2e-5)
+    assert json.loads((tmp_path / "out" / "evaluation.json").read_text())["falls"] == 3
+    assert not (tmp_path / "out" / "frames.png").exists() and (tmp_path / "out" / "metrics.csv").exists()
+
+
+@pytest.mark.slow
 def test_a_resume_in_a_new_process_is_exact(trained, stopped):
     """Two iterations, a checkpoint, and eight more in another process are ten in one, bit for bit."""
     assert Checkpoints(stopped).latest() == 2 and len(rows(stopped)) == 1

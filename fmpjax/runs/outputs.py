@@ -20,12 +20,13 @@ from fmpjax.runs.folder import Run
 from fmpjax.trainer import Trainer
 from fmpjax.viz import curves, render
 
-_EXPORTED = (
-    "metrics.csv evaluation.json steering.json following.json performing.json robustness.json "
-    "ranking-start.json ranking.json "
-    "curves.png steering.png following.png performing.png robustness.png frames.png policy.mp4 policy.gif "
-    "course.mp4 pushed.mp4"
+_CURVES = ("metrics.csv", "curves.png")
+# Figures of a policy and their pictures. Those of the newest one have -last in their names: `fmpjax evaluate --last`.
+_FIGURES = (
+    "evaluation.json steering.json following.json performing.json robustness.json ranking-start.json ranking.json "
+    "steering.png following.png performing.png robustness.png"
 ).split()
+_FILMS = ("frames.png", "policy.mp4", "policy.gif", "course.mp4", "pushed.mp4")  # of the best policy
 
 
 def finish(run: Run, *, pictures: bool = True) -> list[Path]:
@@ -66,10 +67,11 @@ def _pictures(run: Run, trainer: Trainer, played: Episodes) -> list[Path]:
     return paths
 
 
-def export(run: Run, out: Path, *, onnx: bool = False) -> list[Path]:
+def export(run: Run, out: Path, *, onnx: bool = False, best: bool = True) -> list[Path]:
     """Copy what a run has to show, and its policy, without states and demonstration, into ``out``; the paths written.
 
-    With ``onnx`` the policy is also written for other programs, as `fmpjax.deploy` does it.
+    With ``onnx`` the policy is also written for other programs, as `fmpjax.deploy` does it. Without ``best`` policy and
+    figures are the newest ones, and films, which are of the best policy, are left out.
 
     Raises:
       UserError: ``out`` holds another run's results, or cannot be written, or there is no policy for ``onnx``.
@@ -91,11 +93,12 @@ def export(run: Run, out: Path, *, onnx: bool = False) -> list[Path]:
         out.mkdir(parents=True, exist_ok=True)
         for n, text in texts.items():
             write(out / n, text)
-        copied = [Path(shutil.copy2(run.folder / n, out / n)) for n in _EXPORTED if (run.folder / n).exists()]
+        shown = {n: n for n in (*_CURVES, *(_FILMS if best else ()))} | {n: _name(n, best) for n in _FIGURES}
+        copied = [Path(shutil.copy2(run.folder / n, out / to)) for to, n in shown.items() if (run.folder / n).exists()]
         if trained:
-            trainer, state = run.policy()
+            trainer, state = run.policy(best=best)
             learned = policy.of(trainer, state.ppo)
-            origin = origin_of(run)
+            origin = origin_of(run, best=best)
             said = deploy.metadata(learned, trainer.robot, origin)
             copied.append(policy.save(out / "policy.npz", learned, said))
             if onnx:
@@ -105,16 +108,21 @@ def export(run: Run, out: Path, *, onnx: bool = False) -> list[Path]:
         raise UserError(f"folder {out} cannot be written: {error.strerror}") from None
 
 
-def web(run: Run, folder: Path) -> list[Path]:
+def _name(figures: str, best: bool) -> str:
+    """The file of a run with these figures, of its best policy or of its newest."""
+    return figures if best else "-last.".join(figures.rsplit(".", 1))
+
+
+def web(run: Run, folder: Path, *, best: bool = True) -> list[Path]:
     """Write a page on which the run's policy runs in a browser into a new ``folder``; the paths written.
 
     Raises:
       UserError: there is no policy, or `fmpjax.deploy.write_page` refuses it, or ``folder`` cannot be written.
     """
     _check_deployable(run, "--web")
-    trainer, state = run.policy()
+    trainer, state = run.policy(best=best)
     try:
-        return deploy.write_page(folder, policy.of(trainer, state.ppo), trainer.robot, origin_of(run))
+        return deploy.write_page(folder, policy.of(trainer, state.ppo), trainer.robot, origin_of(run, best=best))
     except OSError as error:
         raise UserError(f"folder {folder} cannot be written: {error.strerror}") from None
 
@@ -126,18 +134,18 @@ def _check_deployable(run: Run, option: str) -> None:
         raise UserError(f"run {run.folder} has no checkpoint: {option} needs one, train the run first")
 
 
-def origin_of(run: Run) -> deploy.Origin:
-    """Where the run's policy comes from, as its ONNX file and its card say."""
+def origin_of(run: Run, *, best: bool = True) -> deploy.Origin:
+    """Where the run's best policy, or its newest, comes from, as its ONNX file and its card say."""
     return deploy.Origin(
         run=run.folder.resolve().name,
         config=run.config,
         motions=tuple(run.motions(run.config)),
         commit=run.provenance().get("commit"),
-        evaluation=_measured(run, "evaluation.json"),
+        evaluation=_measured(run, _name("evaluation.json", best)),
         changed=bool(run.provenance().get("uncommitted_changes")),
         commands=_commands(run),
-        steering=_measured(run, "steering.json"),
-        robustness=_measured(run, "robustness.json"),
+        steering=_measured(run, _name("steering.json", best)),
+        robustness=_measured(run, _name("robustness.json", best)),
     )
 
 

@@ -215,8 +215,8 @@ def opened(folder, **changes):
 def test_the_folder_that_is_written_is_named_or_in_the_run(monkeypatch, tmp_path, capsys):
     run = opened(tmp_path / "run", **{"command.kind": "velocity", "env.axes": "heading"})
     asked = []
-    monkeypatch.setattr(runs, "export", lambda run, out, onnx: asked.append((out, onnx)) or [])
-    monkeypatch.setattr(runs, "web", lambda run, folder: asked.append(folder))
+    monkeypatch.setattr(runs, "export", lambda run, out, onnx, best: asked.append((out, onnx)) or [])
+    monkeypatch.setattr(runs, "web", lambda run, folder, best: asked.append(folder))
     for words, expected in (
         (["--onnx"], [(run.folder / "export", True)]),
         ([], [(run.folder / "export", False)]),

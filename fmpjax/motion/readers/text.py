@@ -1,8 +1,8 @@
-"""Text: rows of root xyz (m), quaternion, joints (rad), as Unitree's retargeted LaFAN1 has them.
+"""Text: rows of root xyz (m), quaternion, joints (rad), as Unitree's retargeted LAFAN1 has them.
 
 Cells are separated by commas, semicolons, tabs or spaces. Without a header a row is root xyz, quaternion xyzw and
 joints in the model's order. A header's names put the columns in order; a column of times gives the rate. Otherwise the
-rate is the one in the file's name ("60hz"), or 30 Hz, that of LaFAN1.
+rate is the one in the file's name ("60hz"), or 30 Hz, that of LAFAN1.
 """
 
 import re

@@ -12,7 +12,7 @@ from fmpjax.motion.skeleton import Capture
 
 SIDES = ("left", "right")
 # What skeletons call a limb's joint, beside left or l, right or r; where a skeleton has several, the first counts.
-# LaFAN1 and Mixamo (UpLeg), CMU (femur), Xsens and 100STYLE (Hip, Knee, Ankle, Shoulder), Blender and Unreal (thigh).
+# LAFAN1 and Mixamo (UpLeg), CMU (femur), Xsens and 100STYLE (Hip, Knee, Ankle, Shoulder), Blender and Unreal (thigh).
 JOINT_NAMES = {
     "hip": ("UpLeg", "femur", "UpperLeg", "thigh", "Hip"),
     "knee": ("Leg", "tibia", "LowerLeg", "LowLeg", "calf", "shin", "Knee"),

@@ -14,7 +14,7 @@ from fmpjax.motion import bvh, check, gait, retarget, soles
 from fmpjax.motion.retarget import feet
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-# Joints and their parents, by LaFAN1's names; what is a landmark of the robot; CMU's names.
+# Joints and their parents, by LAFAN1's names; what is a landmark of the robot; CMU's names.
 TREE = {"Hips": None, "Spine": "Hips"}
 LANDMARK = {"Hips": "pelvis", "Spine": "chest"}
 CMU = {"Hips": "root", "Spine": "thorax"}
@@ -71,7 +71,7 @@ def capture(robot, clip, *, unit=100.0, names=None, axes_wxyz=IDENTITY, arms=1.0
 
 @pytest.fixture(scope="module")
 def second():
-    """A little more than a second of the walk at the rate of LaFAN1."""
+    """A little more than a second of the walk at the rate of LAFAN1."""
     return motion.load("walk", frames=(0, 60), rate=30.0)
 
 
@@ -295,7 +295,7 @@ def test_names_of_other_programs(source, kind):
 
 
 def test_a_collar_is_no_shoulder(source):
-    """LaFAN1's LeftShoulder is the collar and LeftArm the shoulder; Xsens has LeftCollar and LeftShoulder."""
+    """LAFAN1's LeftShoulder is the collar and LeftArm the shoulder; Xsens has LeftCollar and LeftShoulder."""
     names = tuple({"Spine": "LeftShoulder"}.get(name, name) for name in source.names)
     assert retarget.joints(source._replace(names=names), "walk")["left_shoulder"] == source.names.index("LeftArm")
 
