@@ -12,6 +12,7 @@ from fmpjax.diagnose.measures import DISTINCT, STEADIEST, STEPS, TRAVELS
 _POTENTIALS = ("fmp", "endpoint", "value")
 _CENTERED = (*_POTENTIALS, "bank16")  # the reward is divided by the score's spread
 _TRANSPORTS = (*_CENTERED, "barycentric")
+_COMMANDS = ("velocity", "phase", "motion")  # whose reward is combined with the prior's before it is measured
 _SECTIONS = (
     "prior",
     "amp",
@@ -65,6 +66,7 @@ class Rule:
     evidence: str  # what the committed runs show
     when: str = ""  # the rule applies, for the page
     methods: tuple[str, ...] = ()  # that have the figure; empty for all
+    not_with: tuple[str, ...] = ()  # commands under which the figure means something else
 
     def sentence(self, history: History) -> str | None:
         """What is wrong; None where the figure is healthy or the rule does not apply.
@@ -72,7 +74,7 @@ class Rule:
         Raises:
           Missing: the history does not have a figure.
         """
-        if self.methods and history.config.method not in self.methods:
+        if self.methods and history.config.method not in self.methods or history.config.command.kind in self.not_with:
             return None
         value = self.measure(history)
         if value is None or value in self.healthy:
@@ -184,6 +186,7 @@ RULES = (
         "walks end between 0.64 and 1.33; `learning_apart/lambda-090-seed2` ends at 0.50, `lafan1_walk_seed1` at "
         "0.33, its best policy at 1.00",
         f"it is at least {TRAVELS:g}, forward or backward",
+        not_with=("phase",),
     ),
     Rule(
         "too fast",
@@ -195,6 +198,7 @@ RULES = (
         "walks end between 0.64 and 1.33; `table1_bank_queries/bank16-fixed-seed0` ends at 1.53, `lafan1_fixed_seed1` "
         "at 1.45, its best policy at 1.30",
         f"it is at least {TRAVELS:g}, forward or backward",
+        not_with=("phase",),
     ),
     Rule(
         "turns wrong",
@@ -205,6 +209,7 @@ RULES = (
         ("features.axes", "motion"),
         "`turn_left` ends at 0.08, straight walks at 0.29 or less; `turn_left` at 4.3 M, where it falls, is at 0.97",
         "it travels",
+        not_with=("phase",),
     ),
     Rule(
         "limps",
@@ -232,8 +237,9 @@ RULES = (
         lambda history: history["train/reward_spread"],
         Range(low=0.45),
         ("prior.spread_floor",),
-        "0.486 to 0.490 in every run, standing ones too; no row under 0.472",
+        "0.486 to 0.490 in every run without a command, standing ones too; no row under 0.472",
         methods=_CENTERED,
+        not_with=_COMMANDS,
     ),
     Rule(
         "reward flat, not centered",
@@ -244,6 +250,7 @@ RULES = (
         ("prior.temperature", "amp.gradient_penalty", "wail.gradient_penalty", "method"),
         "`table1/barycentric-fixed-seed0`, which stands, 0.04; AMP walks at 0.20; no run is of WAIL",
         methods=("amp", "barycentric", "wail"),
+        not_with=_COMMANDS,
     ),
     Rule(
         "reward flat, in its logarithm",

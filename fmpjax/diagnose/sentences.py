@@ -57,6 +57,8 @@ def page() -> str:
     for rule in RULES:
         figure = rule.figure + (f", where {rule.when}" if rule.when else "")
         figure += f" (`{'`, `'.join(rule.methods)}`)" if rule.methods else ""
+        if rule.not_with:
+            figure += " (not with a command)" if rule.not_with[1:] else f" (not with the command `{rule.not_with[0]}`)"
         look = ", ".join(f"`{key}`" for key in rule.look)
         lines.append(tables.row((rule.name, figure, str(rule.healthy), look, rule.evidence)))
     return "\n".join(lines)

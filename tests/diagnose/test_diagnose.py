@@ -247,6 +247,14 @@ def test_a_run_without_an_evaluation_says_what_it_could_not_check():
     )
 
 
+def test_figures_that_a_command_changes_are_not_judged_with_it():
+    flat = dict(train_reward_spread=0.2, late_speed=0.59, turn=0.4)
+    assert list(diagnose.symptoms(history(**flat))) == ["too slow", "turns wrong", "reward flat"]
+    told = history(**flat, settings={"command.kind": "velocity"})
+    assert list(diagnose.symptoms(told)) == ["too slow", "turns wrong"]
+    assert not diagnose.symptoms(history(**flat, settings={"command.kind": "phase"}))
+
+
 @pytest.mark.parametrize(("reset", "settled"), diagnose.SETTLED.items())
 def test_symptoms_early_in_a_run_are_put_in_their_place(reset, settled):
     settings = {"env.reset": reset, "transitions": round(3e6 / settled)}
