@@ -81,7 +81,8 @@ _MEANING = {
     "heading_key_points": "of {points}: place less the root's, in those axes, m",
     "motion_command": "1 for the wanted motion, 0 for the others, in the order of the demonstrations",
     "motion_distances": "running mean of the squared distance to each of them, docs/steering.md of fmpjax",
-    "clip_phase": "share of the demonstration that is over, its sine and cosine once and twice per clip",
+    "clip_phase": "share of the demonstration that is over, its sine and cosine once and twice per clip, and the "
+    "demonstration's joint angles of the next step less their mean, rad",
     "base_ang_vel": "of the root, in its own axes, rad/s",
     "projected_gravity": "where gravity points, a unit vector in the root's axes",
     "velocity_commands": "wanted velocity forward and to the left, m/s, and turn, rad/s",
