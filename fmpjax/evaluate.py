@@ -1,7 +1,7 @@
 """Evaluation of a frozen policy on first episodes (section IV-C of the paper)."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,7 +20,6 @@ from fmpjax.trainer import Trainer
 DETAILED = 64  # episodes whose late speed, joints and feet are analyzed [P]
 WINDOWS = 512  # windows at most on either side of the Sinkhorn discrepancy [D]
 CONTACT_HEIGHT = 0.01  # m, a foot is in contact where a sole point is lower [D]
-LEAST_SPEED = 0.1  # m/s, to which an error in speed is relative at least [D]
 OTHER_SIZES = 3  # times fewer episodes at the sizes of perturbation that are not the headline's [D]
 LISTED = 12  # motions that the table names
 STARTS_SEED = 1  # of the episodes' starts, the same in every evaluation [D]
@@ -88,6 +87,7 @@ class Evaluation:
     power: float  # W, mechanical, of the servos
     joint_ranges: tuple[float, ...]  # degrees, six sagittal joints
     expert_ranges: tuple[float, ...]  # degrees
+    pace: float | None = None  # m/s, the late speed that counts, see `metrics.pace_of`
     obedience: float | None = None  # mean of the command's reward in the steps before a fall; None without a command
     starts: tuple[Start, ...] = ()  # falls at every size of perturbation
     motions: tuple[Share, ...] = ()  # where there are several
@@ -96,9 +96,9 @@ class Evaluation:
     def quality(self) -> float:
         """Share of surviving episodes times one less the relative error of the late speed.
 
-        Too fast is no better than too slow. Where the demonstration turns, speeds are along the own heading.
+        Too fast is no better than too slow. The speed is that of `metrics.pace_of`.
         """
-        return (1.0 - self.falls / self.episodes) * max(0.0, 1.0 - pace_error(vars(self)))
+        return (1.0 - self.falls / self.episodes) * max(0.0, 1.0 - metrics.pace_error(vars(self)))
 
     @property
     def score(self) -> float:
@@ -124,13 +124,6 @@ class Evaluation:
     def to_json(self) -> str:
         """All figures; what is not defined is null."""
         return jsons.dumps(self.record())
-
-
-def pace_error(figures: Mapping[str, Any]) -> float:
-    """Relative error of an evaluation's late speed; 1, as of a robot that stands, where no episode lasts so long."""
-    late = figures["path_speed" if figures["demonstration_turning"] > metrics.TURNS else "late_speed"]
-    unit = max(figures["demonstration_speed"], LEAST_SPEED)
-    return 1.0 if np.isnan(late) else abs(late - figures["demonstration_speed"]) / unit
 
 
 def names(config: Config) -> list[str]:
@@ -259,7 +252,10 @@ class Evaluator:
         late = metrics.summarize(speed)
         own_speed = [planar_speed(clip) for clip in library.clips]
         own_turn = np.array([clip.turning for clip in library.clips])
-        turns = abs(own_turn[played.clip[detail]]) > metrics.TURNS
+        own_axes = self.trainer.config.features.axes == "heading"
+        turns = (abs(own_turn[played.clip[detail]]) > metrics.TURNS) | own_axes
+        path = metrics.summarize(path_speed).mean
+        paced_along = own_axes or library.mean(abs(own_turn)) > metrics.TURNS
         return Evaluation(
             noise=self.noise,
             episodes=len(played.length),
@@ -268,7 +264,7 @@ class Evaluator:
             late_speed=late.mean,
             late_n=late.n,
             late_deviation=float(np.nanstd(speed)) if late.n else float("nan"),
-            path_speed=metrics.summarize(path_speed).mean,
+            path_speed=path,
             turn=metrics.summarize(turn).mean,
             excursion=excursion.mean,
             excursion_n=excursion.n,
@@ -283,6 +279,7 @@ class Evaluator:
             **self._effort(played, length),
             joint_ranges=tuple(np.degrees(metrics.mean_ranges(ranges)).round(2).tolist()),
             expert_ranges=tuple(np.degrees(expert).round(2).tolist()),
+            pace=path if paced_along else late.mean,
             obedience=None if played.obedience is None else float(played.obedience.mean()),
             starts=played.starts,
             motions=self._shares(played, np.where(turns, path_speed, speed), own_speed),

@@ -7,6 +7,8 @@ episode; later rows are never read. The metrics return one value per episode, Na
 """
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +23,7 @@ WINDOW = 1.0  # s, of a joint range [P]
 PERCENTILES = 5.0, 95.0  # that bound a joint range [P]
 STILL = 1e-6  # rad; a joint whose expert range is smaller has no ratio to it [D]
 TURNS = 0.1  # rad/s, from which a demonstration turns [D]
+LEAST_SPEED = 0.1  # m/s, to which an error in speed is relative at least [D]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -352,3 +355,21 @@ def _mean(x: np.ndarray, axis: int | tuple[int, ...]) -> np.ndarray:
     finite = np.isfinite(x)
     count = finite.sum(axis=axis)
     return np.where(count > 0, np.where(finite, x, 0.0).sum(axis=axis) / np.maximum(count, 1), np.nan)
+
+
+def pace_of(figures: Mapping[str, Any]) -> float:
+    """The late speed of an evaluation that counts, m/s.
+
+    It is along the robot's own heading where the demonstration turns, and where the prior sees vectors in heading axes:
+    there nothing tells the policy a direction of the world, and a push turns it for good.
+    """
+    if figures.get("pace") is not None:
+        return figures["pace"]
+    return figures["path_speed" if figures["demonstration_turning"] > TURNS else "late_speed"]
+
+
+def pace_error(figures: Mapping[str, Any]) -> float:
+    """Relative error of an evaluation's pace; 1, as of a robot that stands, where no episode lasts so long."""
+    late = pace_of(figures)
+    unit = max(figures["demonstration_speed"], LEAST_SPEED)
+    return 1.0 if np.isnan(late) else abs(late - figures["demonstration_speed"]) / unit

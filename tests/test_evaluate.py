@@ -208,8 +208,21 @@ def test_late_speed_is_of_the_detailed_episodes(fixed, evaluator):
     """64 at 0.5 m/s, 36 further ones at 3 m/s, which do not count."""
     result = evaluator.measure(walking(fixed, np.repeat([0.5, 3.0], [64, 36])))
     assert result.late_n == 64 and result.late_speed == pytest.approx(0.5, abs=1e-4)
-    assert result.path_speed == pytest.approx(0.5, abs=1e-4) and result.late_deviation == pytest.approx(0, abs=1e-4)
+    assert result.path_speed == pytest.approx(0.5, abs=1e-4) and result.pace == result.late_speed
+    assert result.late_deviation == pytest.approx(0, abs=1e-4)
     assert result.episodes == 100 and result.displacement == pytest.approx((64 * 0.5 + 36 * 3.0) / 100 * 6.0, rel=1e-3)
+
+
+def test_in_heading_axes_the_pace_is_along_the_own_heading(fixed, evaluator, monkeypatch):
+    """Pushed aside for good: from the first step on it faces and walks to the left."""
+    played = walking(fixed, np.full(3, 0.5))
+    played.qpos[..., 1], played.qpos[..., 0] = played.qpos[..., 0].copy(), played.qpos[..., 1].copy()
+    played.qpos[..., 3:7] = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
+    assert evaluator.measure(played).pace == pytest.approx(0.0, abs=1e-4)
+    features = dataclasses.replace(fixed.config.features, axes="heading")
+    monkeypatch.setattr(fixed, "config", dataclasses.replace(fixed.config, features=features))
+    found = evaluator.measure(played)
+    assert found.pace == pytest.approx(0.5, abs=1e-4) and found.late_speed == pytest.approx(0.0, abs=1e-4)
 
 
 def test_work_is_of_the_detailed_episodes_and_undefined_without_their_targets(fixed, evaluator):

@@ -574,13 +574,16 @@ def test_memory_that_runs_out_leaves_the_last_checkpoint_good(trained, tmp_path,
     ],
 )
 def test_quality(falls, speed, demonstration, expected):
-    names = [f.name for f in dataclasses.fields(Evaluation) if f.name not in ("obedience", "starts", "motions")]
+    names = [f.name for f in dataclasses.fields(Evaluation) if f.name not in ("pace", "obedience", "starts", "motions")]
     nothing = dict.fromkeys(names, 0.0)
     known = {"episodes": 10, "falls": falls, "late_speed": speed, "demonstration_speed": demonstration}
     assert Evaluation(**nothing | known).quality == pytest.approx(expected)
     # Turns to the left and to the right, whose mean is none: the speed along the own heading counts.
     turning = known | {"late_speed": 0.1, "path_speed": speed, "demonstration_turning": 0.4}
     assert Evaluation(**nothing | turning).quality == pytest.approx(expected)
+    # In heading axes a policy has no direction to keep.
+    drifting = known | {"late_speed": 0.1, "pace": speed}
+    assert Evaluation(**nothing | drifting).quality == pytest.approx(expected)
 
 
 @pytest.mark.slow

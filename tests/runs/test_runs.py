@@ -182,7 +182,7 @@ ROW = {"train/reward": 0.5}
 def evaluation(falls, obedience=None):
     """Figures of ten episodes at the demonstration's own speed, of which some fell: the quality is 1 - falls / 10."""
     fields = [f.name for f in dataclasses.fields(Evaluation) if f.name not in ("obedience", "starts", "motions")]
-    known = {"episodes": 10, "falls": falls, "late_speed": 0.8, "demonstration_speed": 0.8}
+    known = {"episodes": 10, "falls": falls, "late_speed": 0.8, "pace": 0.8, "demonstration_speed": 0.8}
     known |= {"joint_ranges": (0.0,) * 6, "expert_ranges": (0.0,) * 6, "obedience": obedience}
     return Evaluation(**dict.fromkeys(fields, 0.0) | known)
 

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmpjax.config import Config
-from fmpjax.evaluate import pace_error
 from fmpjax.experiments.common import table
 from fmpjax.experiments.common.cells import Cell
 from fmpjax.experiments.common.table import Row
+from fmpjax.metrics import pace_error
 
 WALKS_WITHIN = 0.2  # relative error of the pace at most, of a policy that walks; none of its episodes may fall
 
