@@ -162,7 +162,12 @@ COMMANDS: Mapping[str, Mapping[str, Any]] = {
         "env.last_cap": 500,  # falls of turns on the spot come after more than three seconds
         "ppo.mirror": 1.0,  # else a policy learns the turn to one side better than the other, and falls
     },
-    "phase": {"command.kind": "phase", "env.axes": "heading", "features.axes": "heading"},
+    "phase": {
+        "command.kind": "phase",
+        "env.axes": "heading",
+        "features.axes": "heading",
+        "env.last_cap": 500,  # a clip is longer than three seconds
+    },
     "motion": {"command.kind": "motion", "env.axes": "heading", "features.axes": "heading"},
 }
 
