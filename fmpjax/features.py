@@ -138,14 +138,14 @@ def newest_columns(robot: Robot, form: str) -> list[int]:
     return columns if steps > 1 else []
 
 
-def _command_terms(form: str) -> dict[str, int]:
+def _command_terms(robot: Robot, form: str) -> dict[str, int]:
     """Names and widths of what a policy observes of its command."""
     content, *more = form.split()
     for kind, _, motions in (word.partition("-") for word in more):
         if kind == "velocity":
             return {"velocity_commands": 3} | ({} if content == "deployable" else {"velocity_errors": 3})
         if kind == "phase":
-            return {"clip_phase": 5}
+            return {"clip_phase": 5 + robot.joint_count}
         if kind == "motion":
             distances = {} if content == "deployable" else {"motion_distances": int(motions)}
             return {"motion_command": int(motions)} | distances
@@ -168,7 +168,7 @@ def observation_terms(robot: Robot, form: str) -> dict[str, int]:
     """
     content, *more = form.split()
     joints, axes = robot.joint_count, "heading" if "heading" in more else "root"
-    told = _command_terms(form)
+    told = _command_terms(robot, form)
     if content == "deployable":
         terms = {"base_ang_vel": 3, "projected_gravity": 3} | told
         terms |= {"joint_pos_rel": joints, "joint_vel_rel": joints, "last_action": joints}

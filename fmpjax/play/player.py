@@ -94,12 +94,13 @@ class Player:
         place = sim.qpos if here else sim.policy.default_qpos
         clip = self.clips[self._like(command)] if self.clips else None
         # From the first half, after which there is some of it left to be seen.
-        first = int(self._random.integers(0, max(1, len(clip) // 2))) if clip else 0
+        anywhere = self._in_motion or not self.timed
+        first = int(self._random.integers(0, max(1, len(clip) // 2))) if clip and anywhere else 0
         if clip and self._in_motion:
             qpos, qvel = moved(clip.qpos[first], clip.qpos[first], place), clip.qvel[first].copy()
             turn_wxyz = rotations.multiply(qpos[3:7], rotations.conjugate(clip.qpos[first, 3:7]))
             qvel[:3] = rotations.rotate(turn_wxyz, qvel[:3])
-            sim.place(qpos, qvel)
+            sim.place(qpos, qvel, first)
         else:
             sim.reset()
             sim.place(moved(sim.qpos, sim.qpos, place), np.zeros_like(sim.qvel))
@@ -133,6 +134,8 @@ class Player:
         finite = bool(np.isfinite(sim.qpos).all() and np.isfinite(sim.qvel).all())
         if not finite or (stand_up and self._fallen > LYING):
             self.restart(command, here=finite)
+        elif sim.over:
+            self.restart(command, here=True)
         else:
             self._follow(dt, command)
         self.rows.append(Row(time, sim.velocity(), command.copy(), self._loads()))
@@ -142,6 +145,11 @@ class Player:
     def steered(self) -> bool:
         """Whether the policy takes commands."""
         return "velocity_commands" in self.simulation.policy.terms
+
+    @property
+    def timed(self) -> bool:
+        """Whether the policy is told the time in its clip."""
+        return "clip_phase" in self.simulation.policy.terms
 
     @property
     def lies(self) -> bool:
@@ -172,7 +180,7 @@ class Player:
         """Move the demonstration on; at its end, or far from the robot, it begins again where the robot is."""
         if (ghost := self.ghost) is None:
             return
-        ghost.row += dt * ghost.clip.rate
+        ghost.row = float(self.simulation.row) if self.timed else ghost.row + dt * ghost.clip.rate
         here = self.simulation.qpos
         over = ghost.row > len(ghost.clip) - 1
         clip = self.clips[self._like(command)] if self.steered else ghost.clip

@@ -113,8 +113,10 @@ class RunSource:
         for option in ("timestep", "iterations", "ls_iterations"):
             setattr(model.opt, option, getattr(physics, option))
         model.dof_frictionloss[6:] = physics.frictionloss
-        simulation = sim2sim.Simulation(learned, self.robot.path, model=model)
-        return Player(self.label, simulation, self._clips(), in_motion=self.config.env.reset == "dataset")
+        clips = self._clips()
+        poses = clips[0].qpos[:, 7:] if clips and self.config.command.kind == "phase" else None
+        simulation = sim2sim.Simulation(learned, self.robot.path, model=model, poses=poses)
+        return Player(self.label, simulation, clips, in_motion=self.config.env.reset == "dataset")
 
     def score(self, qpos: np.ndarray, qvel: np.ndarray) -> tuple[float, float] | None:
         """What the prior of the checkpoint that was read last says; None for one of another version, and for live."""

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmpjax.errors import UserError
-from fmpjax.sim2sim.observation import TERMS
+from fmpjax.sim2sim.observation import CLIP_TERMS, TERMS
 from fmpjax.sim2sim.traits import FACTS
 
 
@@ -176,7 +176,7 @@ def _history(said: Mapping[str, str]) -> int:
 def _check(path: str | Path, policy: ExportedPolicy, shapes: tuple[Sequence[int], Sequence[int]]) -> None:
     joints, size = len(policy.joint_names), sum(policy.terms.values())
     for name in policy.terms:
-        if name not in TERMS:
+        if name not in TERMS | CLIP_TERMS:
             raise UserError(f"{path} observes {name!r}, which sim2sim does not know: expected {', '.join(TERMS)}")
     taken, given = map(list, shapes)
     if (taken, given) != ([1, size], [1, joints]):

@@ -46,3 +46,5 @@ TERMS: dict[str, Callable[[Any], np.ndarray]] = {
     "joint_vel_rel": lambda sim: sim.qvel[6:],
     "last_action": lambda sim: sim.action,
 }
+# What needs more than the file of a policy and a model: the clip whose time the policy is told.
+CLIP_TERMS: dict[str, Callable[[Any], np.ndarray]] = {"clip_phase": lambda sim: sim.phase()}

@@ -10,8 +10,9 @@ from fmpjax.errors import UserError
 from fmpjax.sim2sim.differences import differences
 from fmpjax.sim2sim.exported import ExportedPolicy
 from fmpjax.sim2sim.model import check_servos, drives_joint, prepared
-from fmpjax.sim2sim.observation import TERMS
+from fmpjax.sim2sim.observation import CLIP_TERMS, TERMS
 
+_MAKE = TERMS | CLIP_TERMS
 _DEEPEST = 1.5e-3  # m, penetration of the floor at the start; the policy's own robot stands 1 mm in it
 
 
@@ -28,6 +29,7 @@ class Simulation:
         *,
         own_gains: bool = False,
         model: mujoco.MjModel | None = None,
+        poses: np.ndarray | None = None,
     ):
         """Read an MJCF file.
 
@@ -36,11 +38,14 @@ class Simulation:
           path: the file.
           own_gains: keep the file's position servos; otherwise they get the policy's gains and torque limits.
           model: with servos and floor, where the file has been read already; it is taken as it is.
+          poses: ``[M, J]`` rad, the clip at the rate of control, for a policy that is told the time in it.
 
         Raises:
-          UserError: it cannot be read, or is no model of the policy's robot, or has no servos to keep.
+          UserError: it cannot be read, or is no model of the policy's robot, or has no servos to keep; or the policy
+            is told the time in a clip that is not given.
         """
         self.policy, said = policy, []
+        self.poses, self.row = _clip(policy, poses), 0
         if model is None:
             model, said = prepared(policy, path, own_gains)
         self.model = model
@@ -69,7 +74,7 @@ class Simulation:
         self.command, self.errors, self.action = np.zeros(3), np.zeros(3), np.zeros(len(ids))
         self.reset()
         for name, width in policy.terms.items():
-            if (found := policy.history * np.size(TERMS[name](self))) != width:
+            if (found := policy.history * np.size(_MAKE[name](self))) != width:
                 raise UserError(f"the policy's {name} has {width} numbers: expected {found}, as sim2sim makes them")
         self.differences = said + differences(policy, model, ids, self._servo, self._root_body, self.substeps)
         if self.raised:
@@ -99,18 +104,18 @@ class Simulation:
         self.raised = float(depth - _DEEPEST) if depth > _DEEPEST else 0.0
         data.qpos[self._root + 2] += self.raised
         mujoco.mj_kinematics(self.model, data)
-        self.time, self.action, self._past = 0.0, np.zeros(len(self._qpos)), []
+        self.time, self.row, self.action, self._past = 0.0, 0, np.zeros(len(self._qpos)), []
         self.errors = np.zeros(3)  # running mean of velocity less command: m/s, m/s, rad/s
 
-    def place(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Start in a state in the policy's order, ``qpos [7 + J]`` and ``qvel [6 + J]``."""
+    def place(self, qpos: np.ndarray, qvel: np.ndarray, row: int = 0) -> None:
+        """Start in a state in the policy's order, ``qpos [7 + J]`` and ``qvel [6 + J]``, at a row of the clip."""
         data = self.data
         mujoco.mj_resetData(self.model, data)
         data.qpos[self._root : self._root + 7], data.qpos[self._qpos] = qpos[:7], qpos[7:]
         data.qvel[self._root_dof : self._root_dof + 6], data.qvel[self._qvel] = qvel[:6], qvel[6:]
         mujoco.mj_kinematics(self.model, data)
         self.time, self.action, self.raised = 0.0, np.zeros(len(self._qpos)), 0.0
-        self.errors, self._past = np.zeros(3), []
+        self.errors, self._past, self.row = np.zeros(3), [], row
 
     @property
     def root_body(self) -> int:
@@ -145,6 +150,18 @@ class Simulation:
     def _point(self, body: int, offset: np.ndarray) -> np.ndarray:
         return self.data.xpos[body] + offset @ self.data.xmat[body].reshape(3, 3).T
 
+    def phase(self) -> np.ndarray:
+        """What a policy sees of the time in its clip, as `fmpjax.commands.phase` makes it: ``[5 + J]``."""
+        poses, last = self.poses, len(self.poses) - 1
+        angles = 2.0 * np.pi * self.row / last * np.array([1.0, 2.0])
+        wanted = poses[min(self.row + 1, last)] - poses.mean(0)
+        return np.concatenate([[self.row / last], np.sin(angles), np.cos(angles), wanted])
+
+    @property
+    def over(self) -> bool:
+        """Whether the clip has ended whose time the policy is told."""
+        return 0 < len(self.poses) <= self.row + 1
+
     def observe(self) -> np.ndarray:
         """The policy's observation, ``[O]``; ahead of the first steps stands the first again."""
         newest = self._sensed()
@@ -154,7 +171,7 @@ class Simulation:
 
     def _sensed(self) -> list[np.ndarray]:
         """The parts of the observation of this step alone."""
-        return [np.ravel(TERMS[name](self)) for name in self.policy.terms]
+        return [np.ravel(_MAKE[name](self)) for name in self.policy.terms]
 
     def step(self) -> bool:
         """One step of control; whether a body that marks a fall then touches the floor."""
@@ -164,6 +181,7 @@ class Simulation:
         self.data.ctrl[self._servo] = self.policy.center + self.policy.scale * self.action
         mujoco.mj_step(self.model, self.data, self.substeps)
         self.time = self.data.time
+        self.row = min(self.row + 1, max(0, len(self.poses) - 1))
         if not np.isfinite(self.data.qpos).all():
             return True
         mujoco.mj_kinematics(self.model, self.data)
@@ -183,3 +201,12 @@ class Simulation:
         x, y = self.facing
         forward, left = np.array([[x, y], [-y, x]]) @ self.qvel[:2]
         return np.array([forward, left, (self.axes @ self.qvel[3:6])[2]])
+
+
+def _clip(policy: ExportedPolicy, poses: np.ndarray | None) -> np.ndarray:
+    """The clip whose time a policy is told, ``[M, J]`` rad; no rows for one that is told none."""
+    if "clip_phase" not in policy.terms:
+        return np.zeros((0, len(policy.joint_names)))
+    if poses is None:
+        raise UserError("the policy is told the time in a clip, and its file has no clip: expected its run, to play it")
+    return poses

@@ -215,6 +215,8 @@ def test_the_phase_goes_on_and_ends_the_episode_with_the_clip(phased, walk):
     seen = phased.command.observe(jnp.array([0, last // 4, last]))
     np.testing.assert_allclose(seen[0, :5], [0, 0, 0, 1, 1], atol=1e-6)
     assert phased.command.size == seen.shape[1] == 5 + 29 and float(seen[1, 1]) == pytest.approx(1, abs=1e-3)
+    terms = features.observation_terms(phased.robot, "compact heading phase")
+    assert terms["clip_phase"] == 5 + 29 and sum(terms.values()) == phased.observation_size
     joints = phased.library.qpos[:, 7:]
     np.testing.assert_allclose(seen[:, 5:], joints[[1, last // 4 + 1, last]] - joints.mean(0), atol=1e-6)
     frame = jnp.zeros((3, FrameLayout.of(phased.robot).size))

@@ -12,13 +12,17 @@ import urllib.request
 from types import SimpleNamespace
 
 import glfw
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from fmpjax import cli, config, motion, play, policy, robots, sim2sim
+from fmpjax.commands import phase as phases
 from fmpjax.config import preset
 from fmpjax.errors import UserError
+from fmpjax.frames import FrameLayout
+from fmpjax.motion import MotionLibrary
 from fmpjax.play.devices import Gamepad, Keyboard
 from fmpjax.play.player import Drag, Player, moved
 from fmpjax.sim2sim import ExportedPolicy
@@ -109,6 +113,29 @@ def test_a_policy_without_commands_is_told_none(robot):
     alone = play.Session([player(robot, steered=False)])
     assert alone.commands is None
     np.testing.assert_array_equal(alone.tell(np.ones(3)), np.zeros(3))
+
+
+def test_a_policy_that_is_told_the_time_in_a_clip_sees_it_as_in_training(robot, walk):
+    """Row for row what the command of the training shows, and again from a new row at the clip's end."""
+    terms, seen = {"clip_phase": 5 + robot.joint_count}, []
+
+    def act(observation):
+        seen.append(observation)
+        return np.zeros(robot.joint_count)
+
+    learned = sim2sim.read("timed", said(robot, terms), act, ((1, 5 + robot.joint_count), (1, robot.joint_count)))
+    poses = walk.qpos[:, 7:]
+    played = Player("timed", sim2sim.Simulation(learned, robot.path, model=robot.model, poses=poses), (walk,))
+    first, seen[:] = played.simulation.row, []
+    command = phases.make(robot, MotionLibrary.of(walk), jnp.zeros((len(walk) + 1, FrameLayout.of(robot).size)), 1)
+    for _ in range(len(walk) - 1 - first):
+        assert played.simulation.row == played.ghost.row and not played.simulation.over
+        played.step(np.zeros(3), 0.0, stand_up=False)
+    expected = command.observe(jnp.arange(first, len(walk) - 1))
+    np.testing.assert_allclose(np.array(seen), expected, atol=1e-5)
+    assert played.simulation.row < len(walk) // 2 and played.falls in (0, 1)
+    with pytest.raises(UserError, match="its file has no clip: expected its run"):
+        sim2sim.Simulation(learned, robot.path, model=robot.model)
 
 
 def test_a_push_gives_the_robot_its_impulse(robot, session):
