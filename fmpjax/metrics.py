@@ -361,7 +361,7 @@ def pace_of(figures: Mapping[str, Any]) -> float:
     """The late speed of an evaluation that counts, m/s.
 
     It is along the robot's own heading where the demonstration turns, and where the prior sees vectors in heading axes:
-    there nothing tells the policy a direction of the world, and a push turns it for good.
+    there nothing tells the policy a direction of the world, and a push turns it permanently.
     """
     if figures.get("pace") is not None:
         return figures["pace"]

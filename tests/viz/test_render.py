@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fmpjax import robots, runs
+from fmpjax import robots, robustness, runs
 from fmpjax.errors import UserError
-from fmpjax.runs import outputs
+from fmpjax.runs import films, outputs
 from fmpjax.viz import curves, opengl, render, video
 
 SIZE = {"width": 96, "height": 72}
@@ -278,3 +278,17 @@ def test_grid_fills_its_panes_in_order(robot, walk):
     assert (panes[0] != panes[1]).any()
     with pytest.raises(UserError, match="a motion to show has no frames"):
         render.grid(robot, [walk[:0]], ["a"], using="skeleton")
+
+
+@pytest.mark.parametrize(
+    ("heading", "said"), [(0.0, "to its left"), (0.5, "ahead"), (1.0, "to its right"), (-0.5, "back")]
+)
+def test_a_film_says_where_a_push_goes_as_the_robot_sees_it(robot, heading, said):
+    """Pushed along the world's y while it faces ``heading`` half turns from x; then it falls."""
+    qpos = np.tile(robot.default_qpos, (100, 1, 1))
+    qpos[..., 3:7] = [np.cos(heading * np.pi / 2), 0.0, 0.0, np.sin(heading * np.pi / 2)]
+    pushes = np.zeros((100, 1, 6))
+    pushes[40, 0, 1] = 0.5
+    words = films._happened(robustness.Played(qpos, np.array([80]), np.array([True]), pushes), 0, 50.0)
+    assert words[39] == "" and words[40] == words[69] == f"pushed {said}, 0.5 m/s"
+    assert words[70] == words[79] == "" and words[80] == words[99] == "fell"
