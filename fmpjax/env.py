@@ -97,6 +97,7 @@ class Steps(NamedTuple):
     window: jax.Array  # [T, N, H] int32 indices into the frame table
     obeyed: Any = ()  # [T, N] in [0, 1], what obeying the command earned; nothing without commands
     wanted: Any = ()  # [T, N] int32 indices into the frame table, where the command names the frame to reach
+    label: Any = ()  # [T, N] int32 indices of the demonstrations, where the command names one
 
 
 def window_count(library: MotionLibrary, config: Config) -> int:
@@ -201,6 +202,10 @@ class Env:
     def window_share(self) -> np.ndarray | None:
         """How often each of those windows is drawn, ``[W]``, summing to one; None where all are alike."""
         return self.library.share_after(self.first_row, MOST_WINDOWS)
+
+    def window_clips(self) -> np.ndarray:
+        """Index of the demonstration of each of those windows, ``[W]``."""
+        return self.library.clip_of(self.library.rows_after(self.first_row, MOST_WINDOWS))
 
     def clip_of(self, rows: np.ndarray) -> np.ndarray:
         """Index of the demonstration of each table row, 0 for the default pose."""
@@ -331,9 +336,10 @@ class Env:
         reached = self.advance(now.physics, action, now.disturbed, drawn.disturbed)
         age = now.age + 1
         timed_out = (age >= cap) & ~reached.fell
-        command, obeyed, wanted = (), (), ()
+        command, obeyed, wanted, label = (), (), (), ()
         if self.command:
             wanted = self.command.wanted(now.command) if self.command.wanted else ()
+            label = self.command.label(now.command) if self.command.label else ()
             command, over, obeyed = self.command.advance(now.command, drawn.command, reached.observed.frame)
             timed_out |= over & ~reached.fell
         window = sharding.split(jnp.concatenate([now.window[:, 1:], drawn.row[:, None]], axis=1))
@@ -353,6 +359,7 @@ class Env:
             window=window,
             obeyed=obeyed,
             wanted=wanted,
+            label=label,
         )
         done = reached.fell | timed_out
         sim, observed = self._begin(drawn.start, drawn.key)

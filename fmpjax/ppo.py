@@ -195,10 +195,13 @@ class PPO:
             x = jnp.concatenate([x, age[..., None] / self.clock], axis=-1)
         return jnp.squeeze(self._critic.apply(critic, x), axis=-1)
 
-    def update(self, state: PPOState, batch: Batch, key: jax.Array) -> tuple[PPOState, dict[str, jax.Array]]:
-        """One PPO update from a rollout."""
+    def update(
+        self, state: PPOState, batch: Batch, key: jax.Array, settling: jax.Array | bool = False
+    ) -> tuple[PPOState, dict[str, jax.Array]]:
+        """One PPO update from a rollout; ``settling`` says whether the run is in its last part, `PPOConfig.settle`."""
         # long: the two losses close over the rollout and its targets
         config = self.config
+        discount, gae_lambda, target_kl = self._horizon(settling)
         before = None if batch.age is None else batch.age - 1
         value = self.value(state, batch.observation, before)
         next_value = self.value(state, batch.next_observation, batch.age)
@@ -208,8 +211,8 @@ class PPO:
             next_value,
             batch.fell,
             batch.timed_out,
-            config.discount,
-            config.gae_lambda,
+            discount,
+            gae_lambda,
             config.fall_value,
         )
         returns = advantage + value
@@ -274,7 +277,7 @@ class PPO:
             actor_optimizer,
             critic_optimizer,
             self.observe(state.normalizer, batch.observation),
-            adapt_rate(state.rate, actor_stats["kl"], config.target_kl),
+            adapt_rate(state.rate, actor_stats["kl"], target_kl),
         )
         metrics = {
             "rate": new_state.rate,
@@ -293,6 +296,16 @@ class PPO:
         }
         metrics |= {name: actor_stats[name] for name in ("asymmetry", "estimate_error") if name in actor_stats}
         return new_state, metrics
+
+    def _horizon(self, settling: jax.Array | bool) -> tuple[Any, Any, Any]:
+        """Discount, lambda and KL divergence of an update; a rate that is constant stays so."""
+        config = self.config
+        usual = config.discount, config.gae_lambda, config.target_kl
+        if not config.settle:
+            return usual
+        last = config.settle_discount, config.settle_gae_lambda, config.settle_target_kl
+        discount, gae_lambda, target_kl = (jnp.where(settling, *pair) for pair in zip(last, usual, strict=True))
+        return discount, gae_lambda, target_kl if config.target_kl else 0.0
 
     def _epochs(self, loss, params, optimizer_state, rate, flat, key, epochs: int, batch: int):
         """Minibatch descent of ``loss``; statistics are means over the last epoch, skips are counted over all."""
@@ -352,9 +365,12 @@ def generalized_advantage(
     return advantage
 
 
-def adapt_rate(rate: jax.Array, kl: jax.Array, target: float) -> jax.Array:
-    """Learning rate over 1.5 where the KL divergence is above twice the target, times 1.5 below half of it."""
-    if not target:
+def adapt_rate(rate: jax.Array, kl: jax.Array, target: jax.Array | float) -> jax.Array:
+    """Learning rate over 1.5 where the KL divergence is above twice the target, times 1.5 below half of it.
+
+    Where the target is the number 0, the rate stays as it is.
+    """
+    if isinstance(target, float) and not target:
         return rate
     factor = jnp.where(kl > 2.0 * target, 1 / 1.5, jnp.where(kl < 0.5 * target, 1.5, 1.0))
     return jnp.clip(rate * factor, 1e-5, 1e-2)

@@ -156,7 +156,11 @@ class Played(NamedTuple):
 
 
 def play(trainer: Trainer, state: PPOState, told: np.ndarray, rng: np.random.Generator) -> Played:
-    """Episodes under the commands ``told [T, N, 3]``, from states whose demonstration moves most like the first."""
+    """Episodes under the commands ``told [T, N, 3]``, from states whose demonstration moves most like the first.
+
+    The policy is told them as in training, at most as fast as `CommandConfig.ramp`.
+    """
+    told = velocity.ramped(told, trainer.config.command.ramp, trainer.config.control_rate)
     table = np.concatenate([velocity.velocities(clip) for clip in trainer.env.library.clips])
     rows = []
     for command in told[0]:

@@ -65,7 +65,8 @@ class Trainer:
         # What windows are compared in is the same for every method; what its prior is given need not be.
         self.prior_map = self.feature_map.unclipped() if priors.normalizes(config.method) else self.feature_map
         self.prior_expert = self.expert._replace(windows=self.prior_map(windows))
-        self.prior = priors.make(config.method, self.prior_expert, config)
+        label = self.env.window_clips() if config.command.labeled else None
+        self.prior = priors.make(config.method, self.prior_expert, config, label)
         self._init = jax.jit(self._first)  # one program: compiled one by one, its operations take seconds
 
     @property
@@ -115,7 +116,9 @@ class Trainer:
         env, steps = self.env.rollout(state.env, self.ppo.act(state.ppo), rollout_key, self.config.ppo.rollout_steps)
         prior, reward, prior_metrics = self.prior.update(state.prior, self._rollout(state, steps), prior_key)
         reward, command_metrics = self._commanded(steps, reward)
-        ppo, ppo_metrics = self.ppo.update(state.ppo, policy_batch(steps, reward), ppo_key)
+        ppo, ppo_metrics = self.ppo.update(
+            state.ppo, policy_batch(steps, reward), ppo_key, state.iteration >= self.config.settles_at
+        )
         skipped = prior_metrics.get("skipped", 0.0) + ppo_metrics["skipped"]
         nonfinite = state.nonfinite + steps.nonfinite.sum().astype(jnp.int32) + jnp.int32(skipped)
         figures = (
@@ -136,6 +139,8 @@ class Trainer:
         # Devices split the windows as the prior does, by rows of the rollout: indices travel, windows do not.
         windows = self.prior_map(table[sharding.gather(steps.window)])
         rollout = priors.Rollout(windows, ~steps.nonfinite, steps.length == 1)
+        if self.config.command.labeled:
+            rollout = rollout._replace(label=steps.label)
         if not priors.follows(self.config.method):
             return rollout
         reached, wanted = self.feature_map.placed(steps.frame), self.feature_map.placed(table[steps.wanted])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fmpjax.acting import Seen
-from fmpjax.config import PPOConfig
+from fmpjax.config import PPOConfig, preset
 from fmpjax.ppo import PPO, Batch, adapt_rate, generalized_advantage
 
 STEPS, COUNT = 8, 16
@@ -334,6 +334,28 @@ def test_rate_follows_the_divergence():
     np.testing.assert_allclose(adapt_rate(jnp.float32(1.2e-5), jnp.float32(1.0), 0.03), 1e-5)
     np.testing.assert_allclose(adapt_rate(jnp.float32(9e-3), jnp.float32(0.0), 0.03), 1e-2)
     assert adapt_rate(rate, jnp.float32(5.0), 0.0) is rate
+
+
+@pytest.mark.parametrize("settling", [False, True])
+def test_a_run_settles_by_its_last_values(settling):
+    """As with them from the start; before, as without the setting. A rate that is constant stays so."""
+    usual = {"discount": 0.9, "gae_lambda": 0.8, "target_kl": 0.03}
+    last = {"discount": 0.99, "gae_lambda": 0.95, "target_kl": 1e-6}
+    ppo, state, _ = make(**usual, settle=0.2, **{f"settle_{name}": value for name, value in last.items()})
+    batch = random_batch(ppo, state)
+    one, told = jax.jit(ppo.update)(state, batch, jax.random.PRNGKey(2), settling)
+    other, expected = make(**(last if settling else usual))[2](state, batch, jax.random.PRNGKey(2))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), one, other)
+    assert float(told["rate"]) == float(expected["rate"])
+    constant = make(target_kl=0.0, settle=0.2)[0]
+    assert float(jax.jit(constant.update)(state, batch, jax.random.PRNGKey(2), settling)[0].rate) == float(state.rate)
+
+
+def test_the_last_part_of_the_budget_settles():
+    config = preset("smoke", **{"ppo.settle": 0.25, "chunk": 2})
+    config = dataclasses.replace(config, transitions=config.transitions_per_iteration * 8)
+    assert (config.iterations, config.settles_at) == (8, 6)
+    assert preset("smoke").settles_at == preset("smoke").iterations
 
 
 def test_rate_is_adapted_once_an_update_and_used_by_the_next():

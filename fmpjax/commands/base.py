@@ -23,6 +23,8 @@ class Command(NamedTuple):
     reveal: Callable[[Any], jax.Array] | None = None
     # state -> rows [N] of the table whose frames the next step should reach; None where the command names none
     wanted: Callable[[Any], jax.Array] | None = None
+    # state -> [N] int32, index of the demonstration that the next step should be of; None where the command names none
+    label: Callable[[Any], jax.Array] | None = None
 
 
 class Told(NamedTuple):

@@ -1,7 +1,8 @@
 """A commanded velocity in the heading frame: ahead, to the left, turning to the left."""
 
 import itertools
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +25,7 @@ class Velocity(NamedTuple):
     value: jax.Array  # [N, 3] m/s ahead, m/s to the left, rad/s to the left
     left: jax.Array  # [N] int32, control steps for which it is still held
     off: jax.Array  # [N, 3] running mean of the errors, in the same units
+    goal: Any = ()  # [N, 3] what the value moves toward; nothing where it changes at once
 
 
 def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrary) -> Command:
@@ -35,6 +37,8 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
     The running mean of the errors determines what a step earns. In a walk the root turns and surges back and forth with
     every stride, by more than an error that matters: a reward of the present error would hardly depend on how well the
     policy obeys. The networks see the running mean, since without it they cannot tell what a step will earn.
+
+    With `CommandConfig.ramp` the commanded velocity moves to a new one as fast as a robot can be expected to.
 
     Args:
       config: of the command.
@@ -54,7 +58,7 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
     shortest, longest = (max(1, round(seconds * rate)) for seconds in config.hold)
     newest = min(1.0, 1.0 / (rate * config.average))
     ranges = None if config.ranges is None else jnp.asarray(config.ranges, jnp.float32)
-    layout = FrameLayout.of(robot)
+    layout, most = FrameLayout.of(robot), change(config.ramp, rate)
 
     def draw(key, shape):
         value_key, other_key, zero_key, hold_key = jax.random.split(key, 4)
@@ -69,18 +73,21 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
         return Velocity(jnp.where(zero[..., None], 0.0, value), hold, jnp.zeros_like(value))
 
     def begin(rows, drawn):
-        return Velocity(table[rows], drawn.left, jnp.zeros_like(drawn.value))
+        value = table[rows]
+        return Velocity(value, drawn.left, jnp.zeros_like(drawn.value), () if most is None else value)
 
     def advance(state, drawn, frame):
         error = compressed(layout.heading_velocity(frame) - state.value, config.error_scale)
         off = state.off + newest * (error - state.off)
-        held = state._replace(off=off)
         never = jnp.zeros(state.left.shape, bool)
-        if drawn is None:
-            return Told(held, never, reward(off))
-        over = state.left <= 1
-        value = jnp.where(over[..., None], drawn.value, state.value)
-        return Told(Velocity(value, jnp.where(over, drawn.left, state.left - 1), off), never, reward(off))
+        left, goal = state.left, state.value if most is None else state.goal
+        if drawn is not None:
+            over = left <= 1
+            left, goal = jnp.where(over, drawn.left, left - 1), jnp.where(over[..., None], drawn.value, goal)
+        if most is None:
+            return Told(Velocity(goal, left, off), never, reward(off))
+        value = state.value + jnp.clip(goal - state.value, -most, most)
+        return Told(Velocity(value, left, off, goal), never, reward(off))
 
     def reward(off):
         # Unlike a Gaussian's, the slope does not vanish for errors many widths large.
@@ -89,6 +96,22 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
         return linear * turning  # in a sum, a robot that stands would earn most of what turning on the spot does
 
     return Command(3, draw, begin, advance, lambda state: state.value, lambda state: state.off)
+
+
+def change(ramp: Sequence[float], rate: float) -> np.ndarray | None:
+    """The largest change of a command in one control step, ``[3]`` m/s, m/s, rad/s; None where there is no limit."""
+    return np.array([ramp[0], ramp[0], ramp[1]], np.float32) / rate if ramp else None
+
+
+def ramped(commands: np.ndarray, ramp: Sequence[float], rate: float) -> np.ndarray:
+    """Commands ``[T, ..., 3]`` of T control steps as a policy is told them, which begins with the first."""
+    most = change(ramp, rate)
+    if most is None:
+        return commands
+    told = [commands[0]]
+    for command in commands[1:]:
+        told.append(told[-1] + np.clip(command - told[-1], -most, most))
+    return np.stack(told)
 
 
 def compressed(error: jax.Array, scale: float) -> jax.Array:

@@ -80,7 +80,8 @@ def make(config: CommandConfig, rate: float, robot: Robot, library: MotionLibrar
     def observe(state):
         return jax.nn.one_hot(state.clip, count)
 
-    return Command(count, draw, begin, advance, observe, lambda state: state.distance)
+    label = lambda state: state.clip  # noqa: E731
+    return Command(count, draw, begin, advance, observe, lambda state: state.distance, label=label)
 
 
 def posture(frame: jax.Array, layout: FrameLayout) -> jax.Array:

@@ -106,6 +106,8 @@ class CommandConfig(Section):
     # how the prior's reward and the command's are combined; "prior" and "command": only that one's counts [D]
     combine: Literal["product", "sum", "prior", "command"] = "product"
     weight: PositiveFloat = 1.0  # weight of the command's reward in a sum [D]
+    # each motion has a prior of its own, for the steps in which the policy is told this motion [D]
+    labeled: bool = False
     hold: tuple[float, ...] = (1.0, 3.0)  # s, shortest and longest time until a new velocity or motion is drawn [D]
     zero: Annotated[float, Meta(ge=0, le=1)] = 0.1  # share of the drawn velocities that are zero [D]
     # m/s, slowest and fastest velocity ahead; if all three ranges are empty: the demonstrations' own velocities [D]
@@ -114,6 +116,8 @@ class CommandConfig(Section):
     sideways: tuple[float, ...] = ()
     # rad/s, slowest and fastest turning to the left; empty: 0 if another range is given [D]
     turn: tuple[float, ...] = ()
+    # m/s² and rad/s², how fast the policy is told of a new velocity; empty: at once [D]
+    ramp: tuple[PositiveFloat, ...] = ()
     average: PositiveFloat = 0.5  # s, time constant of the running means of errors and distances [D: half a stride]
     # m/s and rad/s; a larger error counts in this mean by its logarithm [D: the whole error asks for a leap]
     error_scale: PositiveFloat = 0.3
@@ -140,6 +144,13 @@ class CommandConfig(Section):
                     f"setting command.{name} is {', '.join(f'{end:g}' for end in ends) or 'empty'}: expected two "
                     "numbers, the lower one first"
                 )
+        if len(self.ramp) not in (0, 2):
+            raise UserError(
+                f"setting command.ramp is {', '.join(f'{limit:g}' for limit in self.ramp)}: expected two numbers, "
+                "m/s² and rad/s², or none"
+            )
+        if self.labeled and self.kind != "motion":
+            raise UserError(f"setting command.labeled is true and command.kind {self.kind!r}: expected 'motion'")
         if not self.hold[0] > 0:
             raise UserError(f"setting command.hold begins with {self.hold[0]:g}: expected more than 0 s")
 
@@ -223,6 +234,12 @@ class PPOConfig(Section):
     discount: Fraction = 0.99  # gamma, discount of future rewards [P]
     gae_lambda: Fraction = 0.95  # lambda of the generalized advantage estimate [P]
     fall_value: float = 0.0  # return after a fall, in rewards [M: 0]
+    # share of the budget, at its end, in which the three values below take the place of the discount, lambda and KL
+    # divergence above [D]
+    settle: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    settle_discount: Fraction = 0.985  # gamma at the end [D]
+    settle_gae_lambda: Fraction = 0.95  # lambda at the end [D]
+    settle_target_kl: PositiveFloat = 0.008  # KL divergence at the end [D]
     clip: PositiveFloat = 0.2  # limit on the distance of the probability ratio from 1 [P]
     advantage_clip: PositiveFloat = 4.0  # limit on the magnitude of normalized advantages [M]
     bound_penalty: NonNegativeFloat = 10.0  # weight of the penalty sum max(|mean| - 1, 0)^2 on the mean action [M]
@@ -296,6 +313,11 @@ class Config(Section):
         return -(-self.transitions // call) * self.chunk
 
     @property
+    def settles_at(self) -> int:
+        """The iteration from which the policy settles; that after the last one where it never does."""
+        return round((1.0 - self.ppo.settle) * self.iterations)
+
+    @property
     def control_rate(self) -> float:
         """Control steps per second, Hz."""
         return 1.0 / (self.physics.timestep * self.physics.substeps)
@@ -320,6 +342,11 @@ class Config(Section):
                 f"setting ppo.estimator is {', '.join(map(str, self.ppo.estimator))}: expected nothing unless "
                 f"env.observation is 'deployable' and env.axes 'heading' (now {self.env.observation!r} and "
                 f"{self.env.axes!r}), for it estimates a velocity in heading axes that this observation leaves out"
+            )
+        if self.command.labeled and self.method in ("pwil", "smp"):
+            raise UserError(
+                f"setting command.labeled is true and method {self.method!r}: expected a method that learns while the "
+                "policy does, and that scores each window by itself"
             )
         longest = self.env.longest_episode
         if self.method == "pwil" and self.pwil.slack * longest >= 1:

@@ -40,6 +40,8 @@ def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
         "observation_widths": _list(terms.values()),
         "command_ranges": _list(f"{low};{high}" for low, high in (origin.commands or {}).values()),
         # s, and m/s and rad/s: time constant of the running means in velocity_errors, and what counts of an error
+        # m/s², m/s² and rad/s²: how fast the policy must be told of a new velocity; empty: at once
+        "command_ramp": ";".join(map(str, (ramp[0], ramp[0], ramp[1]))) if (ramp := origin.config.command.ramp) else "",
         "command_average": str(origin.config.command.average),
         "command_error_scale": str(origin.config.command.error_scale),
         "action_offset": _list(policy.center),

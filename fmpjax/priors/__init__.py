@@ -2,9 +2,11 @@
 
 from collections.abc import Callable
 
+import numpy as np
+
 from fmpjax.config import FOLLOWERS, Config
 from fmpjax.errors import UserError
-from fmpjax.priors import add, amp, barycentric, empirical, flow, gail, pwil, smp, tracking, wail
+from fmpjax.priors import add, amp, barycentric, empirical, flow, gail, labeled, pwil, smp, tracking, wail
 from fmpjax.priors.base import Expert, MotionPrior, Pretraining, Reward, Rollout, couple, median_reward
 
 _REGISTRY: dict[str, Callable[[Expert, Config], MotionPrior]] = {
@@ -29,14 +31,15 @@ _PRETRAINED = ("smp",)
 _POTENTIALS = ("fmp", "endpoint", "value")
 
 
-def make(method: str, expert: Expert, config: Config) -> MotionPrior:
-    """The prior called ``method``.
+def make(method: str, expert: Expert, config: Config, label: np.ndarray | None = None) -> MotionPrior:
+    """The prior called ``method``, with ``label [W]`` of the expert's windows one for each label.
 
     Raises:
       UserError: unknown method.
     """
     check(method)
-    return _REGISTRY[method](expert, config)
+    build = _REGISTRY[method]
+    return build(expert, config) if label is None else labeled.make(lambda part: build(part, config), expert, label)
 
 
 def register(method: str, make: Callable[[Expert, Config], MotionPrior]) -> None:

@@ -25,6 +25,7 @@ class Rollout(NamedTuple):
     # [T, N, F] compact frames after the steps, x and y 0, in the features' axes; None unless the method follows
     frame: jax.Array | None = None
     wanted: jax.Array | None = None  # [T, N, F] the demonstration's at the commanded time, likewise
+    label: jax.Array | None = None  # [T, N] int32, the demonstration that was commanded; None unless it is labeled
 
 
 class Expert(NamedTuple):

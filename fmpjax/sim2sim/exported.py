@@ -38,6 +38,7 @@ class ExportedPolicy(NamedTuple):
     robot: str
     average: float = 0.5  # s, time constant of the running means of the velocity's errors
     error_scale: float = 0.3  # m/s and rad/s; a larger error counts in them by its logarithm
+    ramp: np.ndarray | None = None  # [3] how fast it is told of a new one (m/s², m/s², rad/s²); None: at once
     commands: np.ndarray | None = None  # [2, 3] lowest and highest velocity that it may be told (m/s, m/s, rad/s)
 
 
@@ -116,6 +117,7 @@ def read(
             robot=said["robot"],
             average=float(said.get("command_average", 0.5)),
             error_scale=float(said.get("command_error_scale", 0.3)),
+            ramp=_rows(said["command_ramp"])[0] if said.get("command_ramp") else None,
             commands=_rows(said["command_ranges"]).T if said.get("command_ranges") else None,
         )
     except KeyError as error:
@@ -189,3 +191,5 @@ def _check(path: str | Path, policy: ExportedPolicy, shapes: tuple[Sequence[int]
         raise UserError(f"{path} has {len(policy.default_qpos)} numbers in default_qpos: expected {7 + joints}")
     if policy.commands is not None and policy.commands.shape != (2, 3):
         raise UserError(f"{path} has command_ranges of shape {policy.commands.shape[::-1]}: expected (3, 2)")
+    if policy.ramp is not None and not (policy.ramp.shape == (3,) and (policy.ramp > 0).all()):
+        raise UserError(f"{path} has command_ramp {policy.ramp.tolist()}: expected three numbers above 0")

@@ -39,7 +39,7 @@ TERMS: dict[str, Callable[[Any], np.ndarray]] = {
     # What a robot senses, under the names of Unitree's programs.
     "base_ang_vel": lambda sim: sim.qvel[3:6],
     "projected_gravity": lambda sim: -sim.axes[2],
-    "velocity_commands": lambda sim: sim.command,
+    "velocity_commands": lambda sim: sim.told,
     "velocity_errors": lambda sim: sim.errors,
     "joint_pos": lambda sim: sim.qpos[7:],
     "joint_pos_rel": lambda sim: sim.qpos[7:] - sim.policy.center,

@@ -72,6 +72,7 @@ class Simulation:
         self._falls = [(self._body(s, path), s["ends"], s["radius"]) for s in policy.fall_shapes]
         self.time, self.raised = 0.0, 0.0
         self.command, self.errors, self.action = np.zeros(3), np.zeros(3), np.zeros(len(ids))
+        self._told = np.zeros(3)
         self.reset()
         for name, width in policy.terms.items():
             if (found := policy.history * np.size(_MAKE[name](self))) != width:
@@ -106,6 +107,7 @@ class Simulation:
         mujoco.mj_kinematics(self.model, data)
         self.time, self.row, self.action, self._past = 0.0, 0, np.zeros(len(self._qpos)), []
         self.errors = np.zeros(3)  # running mean of velocity less command: m/s, m/s, rad/s
+        self._told = np.zeros(3)
 
     def place(self, qpos: np.ndarray, qvel: np.ndarray, row: int = 0) -> None:
         """Start in a state in the policy's order, ``qpos [7 + J]`` and ``qvel [6 + J]``, at a row of the clip."""
@@ -115,7 +117,7 @@ class Simulation:
         data.qvel[self._root_dof : self._root_dof + 6], data.qvel[self._qvel] = qvel[:6], qvel[6:]
         mujoco.mj_kinematics(self.model, data)
         self.time, self.action, self.raised = 0.0, np.zeros(len(self._qpos)), 0.0
-        self.errors, self._past, self.row = np.zeros(3), [], row
+        self.errors, self._past, self.row, self._told = np.zeros(3), [], row, self.command.copy()
 
     @property
     def root_body(self) -> int:
@@ -158,6 +160,11 @@ class Simulation:
         return np.concatenate([[self.row / last], np.sin(angles), np.cos(angles), wanted])
 
     @property
+    def told(self) -> np.ndarray:
+        """The command as the policy is told it, ``[3]``: it follows a new one as fast as in training."""
+        return self.command if self.policy.ramp is None else self._told
+
+    @property
     def over(self) -> bool:
         """Whether the clip has ended whose time the policy is told."""
         return 0 < len(self.poses) <= self.row + 1
@@ -187,9 +194,12 @@ class Simulation:
         mujoco.mj_kinematics(self.model, self.data)
         if "velocity_errors" in self.policy.terms:
             newest, scale = min(1.0, self.policy.step_dt / self.policy.average), self.policy.error_scale
-            off = self.velocity() - self.command
+            off = self.velocity() - self.told
             counted = np.sign(off) * scale * np.log1p(np.abs(off) / scale)
             self.errors = self.errors + newest * (counted - self.errors)
+        if self.policy.ramp is not None:
+            most = self.policy.ramp * self.policy.step_dt
+            self._told = self._told + np.clip(self.command - self._told, -most, most)
         return any((self._point(body, ends)[:, 2] < radius).any() for body, ends, radius in self._falls)
 
     def push(self, velocity: np.ndarray) -> None:

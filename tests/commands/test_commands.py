@@ -58,7 +58,7 @@ def test_a_frames_velocity_is_in_the_heading_frame(robot, slow_and_left):
 def test_commands_are_demonstrations_velocities_or_between_two(robot, slow_and_left):
     settings = CommandConfig(kind="velocity", hold=(0.5, 1.0), zero=0.2)
     command = velocity.make(settings, RATE, robot, slow_and_left)
-    value, left, _ = (np.asarray(x) for x in command.draw(jax.random.PRNGKey(0), (20_000,)))
+    value, left, *_ = (np.asarray(x) for x in command.draw(jax.random.PRNGKey(0), (20_000,)))
     zero = (value == 0).all(1)
     assert zero.mean() == pytest.approx(0.2, abs=0.01)
     assert left.min() == 25 and left.max() == 50
@@ -125,6 +125,31 @@ def test_a_command_is_held_and_then_another(robot, slow_and_left):
     np.testing.assert_array_equal(after.left, [2, 1, 1])
     assert not over.any()
     np.testing.assert_array_equal(command.advance(state, None, frame).state.value, state.value)
+
+
+def test_a_new_velocity_is_told_as_fast_as_the_ramp(robot, slow_and_left):
+    """By 0.5 m/s² and 1 rad/s² at 50 Hz: 0.01 m/s and 0.02 rad/s a step, in training and as `velocity.ramped` does."""
+    settings = CommandConfig(kind="velocity", ramp=(0.5, 1.0))
+    command = velocity.make(settings, RATE, robot, slow_and_left)
+    goal = jnp.array([[0.415, -0.005, 1.0]])
+    drawn = velocity.Velocity(goal, jnp.array([9]), jnp.zeros((1, 3)))
+    state = command.begin(jnp.array([400]), drawn)._replace(left=jnp.array([1]))
+    values, frame = [np.asarray(state.value)], jnp.zeros((1, FrameLayout.of(robot).size))
+    for given in (drawn, drawn, None):
+        told = command.advance(state, given, frame)
+        state, reward = told.state, told.reward
+        values.append(np.asarray(state.value))
+    np.testing.assert_allclose(np.concatenate(values), np.outer(range(4), [0.01, 0, 0.02]) + [0, -0.005, 0] * (
+        np.arange(4) > 0)[:, None], atol=1e-6)  # fmt: skip
+    np.testing.assert_array_equal(state.goal, goal)
+    np.testing.assert_array_equal(command.observe(state), state.value)
+    asked = np.concatenate([values[0], np.repeat(goal, 60, axis=0)])
+    ramped = velocity.ramped(asked, settings.ramp, RATE)
+    np.testing.assert_allclose(ramped[:4], np.concatenate(values), atol=1e-6)
+    np.testing.assert_allclose(ramped[[41, 42, 60]], [[0.41, -0.005, 0.82], [0.415, -0.005, 0.84], goal[0]], atol=1e-6)
+    np.testing.assert_array_equal(velocity.ramped(asked, (), RATE), asked)
+    # The reward is that of the command as it is told: standing still while told 0.01 m/s earns nearly everything.
+    assert float(reward[0]) > 0.99
 
 
 def test_the_reward_of_a_velocity_in_closed_form(robot, slow_and_left):

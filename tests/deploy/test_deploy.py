@@ -349,13 +349,23 @@ def without_a_floor(root):
 TOLD = np.array([0.3, 0.0, 0.2])  # m/s ahead and to the left, rad/s
 
 
-@pytest.fixture(scope="module", params=["compact", "full", "compact heading velocity", "deployable velocity history-3"])
+TRAINED = (
+    "compact",
+    "full",
+    "compact heading velocity",
+    "compact heading velocity ramp",
+    "deployable velocity history-3",
+)
+
+
+@pytest.fixture(scope="module", params=TRAINED)
 def trained(request, robot, walk, tmp_path_factory):
     """Six steps of training's own physics under a small policy, and the file of that policy."""
     pytest.importorskip("onnxruntime")
     content, *told = request.param.split()
     changes = {"env.observation": content, "physics.timestep": 0.005, "physics.substeps": 4, "physics.threads": 1}
     changes |= {"env.axes": "heading", "command.kind": "velocity"} if told else {}
+    changes |= {"command.ramp": (2.0, 1.0)} if "ramp" in told else {}
     changes |= {"env.observation_history": 3} if content == "deployable" else {}
     made = small(robot, walk, **changes)
     folder = tmp_path_factory.mktemp("policy")
@@ -366,6 +376,8 @@ def trained(request, robot, walk, tmp_path_factory):
     step = jax.jit(native.step)
     command = velocity.make(made.config.command, made.config.control_rate, robot, MotionLibrary.of(walk))
     obeyed = velocity.Velocity(jnp.asarray(TOLD[None], jnp.float32), jnp.array([9]), jnp.zeros((1, 3)))
+    if "ramp" in told:
+        obeyed = obeyed._replace(value=jnp.zeros((1, 3)), goal=obeyed.value)
     observe = jax.jit(lambda *x: features.observe(robot, *x, features.true_form(made.config)))
     actions = action_map(robot, walk, made.config.env.action)
     sensors = disturbances.make(made.config, robot, actions, 3)
