@@ -12,7 +12,7 @@ from fmpjax.robots import Robot
 HARMONICS = (1, 2)  # of the clip's duration, whose sines and cosines the networks see beside the share that is over
 # Share and sharpness of each part of the reward: of the mean squared error of joints (rad²), joint velocities
 # (rad²/s²), root height (m²), and of the root's axes (of unit vectors). [D: chosen on ten seconds of a dance]
-JOINTS, JOINT_VELOCITIES, HEIGHT, TILT = (0.6, 10.0), (0.1, 0.2), (0.15, 40.0), (0.15, 5.0)
+JOINTS, JOINT_VELOCITIES, HEIGHT, TILT = (0.5, 30.0), (0.2, 0.5), (0.15, 40.0), (0.15, 5.0)
 
 
 def make(robot: Robot, library: MotionLibrary, frames: jax.Array, stride: int) -> Command:

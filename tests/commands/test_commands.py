@@ -263,7 +263,7 @@ def test_a_phase_earns_all_for_the_demonstration_and_less_for_what_is_off(phased
     cosine, sine = table[rows + 1][:, layout.cosine], table[rows + 1][:, layout.sine]
     off = table[rows + 1].at[:, layout.cosine].set(cosine * np.cos(angle) - sine * np.sin(angle))
     off = off.at[:, layout.sine].set(sine * np.cos(angle) + cosine * np.sin(angle))
-    np.testing.assert_allclose(phased.command.advance(rows, None, off).reward, 1 - 0.6 * (1 - np.exp(-0.1)), atol=1e-3)
+    np.testing.assert_allclose(phased.command.advance(rows, None, off).reward, 1 - 0.5 * (1 - np.exp(-0.3)), atol=1e-3)
 
 
 def test_a_phase_is_of_one_motion(robot):
@@ -438,6 +438,20 @@ def test_a_run_is_told_velocities_and_measured(told, capsys, monkeypatch):
     with pytest.raises(SystemExit):
         cli.main(["render", str(told), "--course", "0.3:fast"])
     assert "leg '0.3:fast' of the course: expected SECONDS:FORWARD,LEFT,TURN" in capsys.readouterr().err
+
+
+def test_an_evaluation_tells_as_training_does(robot, slow_and_left, monkeypatch):
+    """From the first command to the second by 1 m/s² at 50 Hz."""
+    config = preset("smoke", **{"command.kind": "velocity", "command.ramp": (1.0, 1.0)})
+    trainer = SimpleNamespace(config=config, env=SimpleNamespace(library=slow_and_left))
+    monkeypatch.setattr(steering, "_play", lambda trainer, state, rows, told: (told, rows, *[np.zeros(2)] * 3))
+    asked = np.repeat([[[0.4, 0.0, 0.0]], [[1.0, 0.0, 0.5]]], 50, axis=0)
+    played = steering.play(trainer, None, asked, np.random.default_rng(0))
+    # The start is of the clip that moves like the first command: the slow one, rows 0 to 199.
+    assert played.qpos[0] < 200
+    rate = config.control_rate
+    np.testing.assert_allclose(played.velocity[49:52, 0, 0], [0.4, 0.4 + 1 / rate, 0.4 + 2 / rate], atol=1e-6)
+    np.testing.assert_allclose(played.velocity[-1, 0], [min(1.0, 0.4 + 50 / rate), 0.0, 0.5], atol=1e-6)
 
 
 @pytest.mark.slow
