@@ -257,7 +257,7 @@ def test_a_phase_earns_all_for_the_demonstration_and_less_for_what_is_off(phased
     np.testing.assert_allclose(phased.command.advance(rows, None, table[rows + 1]).reward, 1.0, atol=1e-5)
     late = phased.command.advance(rows, None, table[rows - 10]).reward
     assert (np.asarray(late) < 0.9).all() and (np.asarray(late) > 0.1).all()
-    # A turned world earns the same; joints that are off by 0.1 rad earn 0.6 (1 - exp(-0.1)) less.
+    # A turned world earns the same; joints that are off by 0.1 rad earn 0.5 (1 - exp(-0.3)) less.
     layout = FrameLayout.of(phased.robot)
     angle = 0.1
     cosine, sine = table[rows + 1][:, layout.cosine], table[rows + 1][:, layout.sine]
