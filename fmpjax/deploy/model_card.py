@@ -115,6 +115,8 @@ def card(policy: Policy, robot: Robot, origin: Origin) -> str:
         meaning = _MEANING[name].format(points=", ".join(robot.key_point_names))
         if (steps := features.observation_history(policy.observation)) > 1:
             meaning += f"; of {steps} steps, the oldest first"
+        if name == "velocity_commands" and (ramp := config.command.ramp):
+            meaning += f"; it may change by {ramp[0]:g} m/s and {ramp[1]:g} rad/s in a second at most, as in training"
         if name == "joint_rotation_6d" and robot.jointless_row is not None:
             meaning += f", with a row that is always 1, 0, 0, 0, 0, 1 before joint {robot.jointless_row}"
         rows.append(tables.row((str(start), str(start + width - 1), f"`{name}`", meaning)))

@@ -186,6 +186,15 @@ def test_the_card_has_the_tables_of_obedience_and_of_disturbances(robot, walk):
     assert "| 0 | 0 | 1 |" in card and "were not tried" not in card
 
 
+def test_the_card_says_how_fast_a_command_may_change(robot, walk):
+    told = {"env.observation": "compact", "env.axes": "heading", "command.kind": "velocity"}
+    for ramp, said in (((2.0, 1.0), "; it may change by 2 m/s and 1 rad/s in a second at most"), ((), "")):
+        made = small(robot, walk, **told, **{"command.ramp": ramp})
+        card = deploy.card(made.policy, robot, made.origin)
+        line = next(line for line in card.splitlines() if "`velocity_commands`" in line)
+        assert said in line and (bool(said) == ("it may change" in line))
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [("steering.json", "[]"), ("robustness.json", "[1]"), ("evaluation.json", "{")],
@@ -610,6 +619,7 @@ def test_a_model_or_file_that_does_not_fit_is_refused(exported, robot, tmp_path)
         ("key_points", "[1]", "has metadata that cannot be read"),
         ("observation_terms_scale", "1.0,2.0", "observation_terms_scale is 2.0, and sim2sim knows only 1.0"),
         ("step_dt", "often", "has metadata that cannot be read"),
+        ("command_ramp", "1;0;1", r"has command_ramp \[1.0, 0.0, 1.0\]: expected three numbers above 0"),
         ("observation_names", "a,b,c,d,e,f,g", "observes 'a', which sim2sim does not know"),
         ("observation_widths", "1,6,3,3,29,29,16", r"its metadata says \[1, 87\] to \[1, 29\]"),
     ):
