@@ -334,6 +334,8 @@ class Segment(Source):
     """Length of the shortest stretch, s."""
     out: Annotated[Path | None, default("none")] = None
     """Folder for the stretches that are not broken, as NAME-KIND-FIRST.npz."""
+    forward: bool = False
+    """Write only those that never go backward or to a side for a second: for policies that walk ahead and turn."""
     picture: Annotated[Path | None, default("none")] = None
     """Picture of speed and kinds over time, .png."""
 
@@ -350,7 +352,7 @@ class Segment(Source):
             print(f"wrote {show.timeline(clip, found, self.picture)}")
         if self.out is not None:
             for stretch in found:
-                if stretch.verdict != "broken":
+                if stretch.verdict != "broken" and (not self.forward or segment.forward(stretch.clip)):
                     print(f"wrote {motion.save(stretch.clip, self.out / f'{stretch.clip.name}.npz')}")
 
 

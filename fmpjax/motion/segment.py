@@ -28,6 +28,7 @@ SETTLE = 0.5  # s around a fall that are left out with it
 WALKS, FLIES, RUNS = 0.008, 0.13, 0.52
 FLIGHT, OFF = 0.05, 0.015  # share of the time in which both soles are higher than so many m
 TURNS = 0.3  # rad/s
+BACK, ASIDE = 0.1, 0.3  # m/s backward and to the side, means over `WINDOW`, up to which a stretch goes forward
 MOVES = 0.6  # rad/s, root mean square over the joints
 
 
@@ -136,6 +137,14 @@ def _measured(robot: Robot, clip: MotionClip, first: int, last: int, kind: str, 
     verdict = "broken" if broken else "odd" if faults else "good"
     turning, fault, found = part.turning, faults[0] if faults else "", slice(first, last + 1)
     return Stretch(found, first + offset, last + offset, kind, part, speed, turning, verdict, fault)
+
+
+def forward(clip: MotionClip) -> bool:
+    """Whether a clip stands, or walks and turns ahead: never backward or to a side for a second."""
+    width = min(len(clip), max(1, round(WINDOW * clip.rate)))
+    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(clip.heading_velocities[:, :2], axis=0)])
+    ahead, left = ((sums[width:] - sums[:-width]) / width).T
+    return bool(ahead.min() > -BACK and abs(left).max() < ASIDE)
 
 
 def table(clip: MotionClip, found: list[Stretch], kind: np.ndarray) -> str:

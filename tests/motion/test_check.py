@@ -14,7 +14,7 @@ from PIL import Image
 from fmpjax import cli, motion, robots, rotations
 from fmpjax import config as configuration
 from fmpjax.errors import UserError
-from fmpjax.motion import MotionClip, check, edit, library, segment, soles
+from fmpjax.motion import MotionClip, check, edit, gait, library, segment, soles
 from fmpjax.viz import clip as show
 
 
@@ -533,6 +533,24 @@ def test_segment_command(tmp_path, capsys, long):
     joined = motion.load(tmp_path / "joined.npz").duration
     assert joined == pytest.approx((long.duration + motion.load("walk").duration) / 1.25, abs=0.05)
     assert code("segment", path, "--picture", tmp_path / "a.pdf") == 2
+
+
+def test_stretches_that_go_forward(robot, walk, tmp_path, capsys):
+    """Turned on its path by 180, 90 and 15 degrees, a walk goes backward, to a side, and hardly to a side."""
+
+    def heading_off(degrees):
+        turn = np.array([np.cos(np.radians(degrees / 2)), 0.0, 0.0, np.sin(np.radians(degrees / 2))])
+        qpos = walk.qpos.copy()
+        qpos[:, 3:7] = rotations.multiply(qpos[:, 3:7], turn)
+        return MotionClip.from_qpos("off", walk.robot, walk.rate, qpos)
+
+    assert [segment.forward(heading_off(degrees)) for degrees in (0, 180, 90, 15)] == [True, False, False, True]
+    path = motion.save(gait.make(robot, gait.Command(-0.4, 0.0, 0.0)).clip(4.0), tmp_path / "back.npz")
+    run("segment", path, "--out", tmp_path / "all")
+    run("segment", path, "--out", tmp_path / "ahead", "--forward")
+    assert len(list((tmp_path / "all").glob("*.npz"))) == 1 and not (tmp_path / "ahead").exists()
+    run("segment", motion.save(walk, tmp_path / "walk.npz"), "--out", tmp_path / "ahead", "--forward")
+    assert len(list((tmp_path / "ahead").glob("*.npz"))) == 1 and "walking" in capsys.readouterr().out
 
 
 def test_a_fast_walk_is_no_run(external, robot):
