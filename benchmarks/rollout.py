@@ -45,12 +45,11 @@ def ways(env: Env, backend: NativePhysics, start: EnvState, steps: int) -> dict[
     control = np.ascontiguousarray(
         np.broadcast_to(np.asarray(targets, np.float64)[:, None], (count, steps * backend.substeps, targets.shape[-1]))
     )
-    warmstart = np.zeros_like(qvel)
     pool = mujoco.rollout.Rollout(nthread=backend.threads)
     data = [mujoco.MjData(backend.model) for _ in range(backend.threads)]
 
     def alone():
-        return pool.rollout(backend.model, data, initial, control, initial_warmstart=warmstart)[0]
+        return pool.rollout(backend.model, data, initial, control)[0]
 
     def callback(sim, targets):
         return jax.lax.scan(lambda s, _: (backend.step(s, targets), None), sim, None, length=steps)[0]

@@ -89,10 +89,9 @@ def physics_alone(trainer, state) -> Part:
     qpos, qvel = np.asarray(sim.qpos, np.float64), np.asarray(sim.qvel, np.float64)
     initial = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)
     control = np.repeat(np.asarray(targets, np.float64)[:, None], steps * backend.substeps, axis=1)
-    warmstart = np.asarray(sim.warmstart, np.float64)
     pool = mujoco.rollout.Rollout(nthread=backend.threads)
     data = [mujoco.MjData(backend.model) for _ in range(backend.threads)]
-    return Part(lambda: pool.rollout(backend.model, data, initial, control, initial_warmstart=warmstart)[0])
+    return Part(lambda: pool.rollout(backend.model, data, initial, control)[0])
 
 
 def part(function: Callable[..., Any], *arguments: Any) -> Part:

@@ -13,7 +13,7 @@ class PhysicsState(NamedTuple):
 
     qpos: jax.Array  # [N, 7 + J] root xyz m, root quaternion wxyz, joints rad
     qvel: jax.Array  # [N, 6 + J] root velocity (world) m/s, angular velocity (body) rad/s, joints rad/s
-    warmstart: jax.Array  # [N, 6 + J] accelerations from which the constraint solver starts
+    warmstart: jax.Array  # [N, 6 + J] accelerations from which MJX's constraint solver starts; unused by MuJoCo C
 
 
 class Physics(Protocol):
