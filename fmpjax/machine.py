@@ -96,9 +96,13 @@ def import_mujoco() -> None:
         os.environ.pop("MUJOCO_GL")
         _restore("PYOPENGL_PLATFORM", before["PYOPENGL_PLATFORM"])
         try:
-            import mujoco  # noqa: F401
+            import mujoco  # noqa: F811
         finally:
             _restore("MUJOCO_GL", before["MUJOCO_GL"])
+        # The failed import left these behind, and a new package does not name what is imported already.
+        for name, module in list(sys.modules.items()):
+            if name.count(".") == 1 and name.startswith("mujoco."):
+                setattr(mujoco, name.partition(".")[2], module)
 
 
 def import_mjx() -> None:

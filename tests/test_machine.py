@@ -84,6 +84,7 @@ def test_mujoco_is_imported_whatever_its_variable_says(asked):
     """Also where the library that it names is missing; the variable stays what it was, and pictures come out."""
     code = (
         "import os, fmpjax, numpy as np; from fmpjax.viz import render\n"
+        "import fmpjax.physics.mjx\n"  # which names what `mujoco` consists of
         "robot = fmpjax.load_robot('strider')\n"
         "frames = render.render_frames(robot, robot.default_qpos[None], width=64, height=48)\n"
         "print(os.environ['MUJOCO_GL'], frames.std() > 5)"
