@@ -156,6 +156,7 @@ RULES = (
         ("env.last_cap", "ppo.discount", "evaluations"),
         "`learning_apart/late-128-seed0` 0.08, `mirrored-seed0` 0.05; the slowest that walks is at 0.26",
         f"the excursion is at least {STEPS:g}",
+        not_with=("phase",),
     ),
     Rule(
         "shuffles",
