@@ -70,7 +70,7 @@ class Part(NamedTuple):
 
 
 def physics_alone(trainer, state) -> Part:
-    """A rollout's physics and nothing else, from the environments' present states, of every seed at once."""
+    """The physics of a rollout that the policy plays and nothing else, of every seed at once."""
     import jax
     import jax.numpy as jnp
     import mujoco
@@ -78,17 +78,27 @@ def physics_alone(trainer, state) -> Part:
 
     from fmpjax.physics.native import NativePhysics
 
-    backend, steps = trainer.env.physics, trainer.config.ppo.rollout_steps
-    sim = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), state.env.physics)
-    targets = trainer.env.actions(jnp.zeros(trainer.robot.joint_count))
-    targets = jnp.broadcast_to(targets, (len(sim.qpos), len(targets)))
+    env, backend, steps = trainer.env, trainer.env.physics, trainer.config.ppo.rollout_steps
+
+    def visited(s):
+        """States before each control step, ``[steps, N, ...]``, and the targets of the policy in them."""
+
+        def one(now, key):
+            after, record = env.rollout(now, trainer.ppo.act(s.ppo), key, 1)
+            return after, (now.physics, env.actions(record.action[0]))
+
+        return jax.lax.scan(one, s.env, jax.random.split(jax.random.PRNGKey(0), steps))[1]
+
+    seeds = state.env.age.ndim > 1
+    sim, targets = jax.jit(jax.vmap(visited, out_axes=1) if seeds else visited)(state)
+    sim, targets = jax.tree.map(lambda x: x.reshape(steps, -1, x.shape[-1]), (sim, targets))
     if not isinstance(backend, NativePhysics):
-        return part(
-            lambda s, t: jax.lax.scan(lambda s, _: (backend.step(s, t), None), s, None, length=steps)[0], sim, targets
-        )
-    qpos, qvel = np.asarray(sim.qpos, np.float64), np.asarray(sim.qvel, np.float64)
+        # What a step reaches must be used, or the compiler leaves the step out.
+        each = lambda total, now: (total + backend.step(*now).qvel, None)  # noqa: E731
+        return part(lambda *now: jax.lax.scan(each, jnp.zeros_like(now[0].qvel[0]), now)[0], sim, targets)
+    qpos, qvel, targets = (np.asarray(x, np.float64).reshape(-1, x.shape[-1]) for x in (sim.qpos, sim.qvel, targets))
     initial = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)
-    control = np.repeat(np.asarray(targets, np.float64)[:, None], steps * backend.substeps, axis=1)
+    control = np.repeat(targets[:, None], backend.substeps, axis=1)
     pool = mujoco.rollout.Rollout(nthread=backend.threads)
     data = [mujoco.MjData(backend.model) for _ in range(backend.threads)]
     return Part(lambda: pool.rollout(backend.model, data, initial, control)[0])
