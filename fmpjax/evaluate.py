@@ -102,8 +102,8 @@ class Evaluation:
 
     @property
     def score(self) -> float:
-        """What "best" means: the quality, times the obedience where there is a command."""
-        return self.quality * (1.0 if self.obedience is None else self.obedience)
+        """What "best" means: the quality; with a command, which says the pace, the surviving share times obedience."""
+        return self.quality if self.obedience is None else (1.0 - self.falls / self.episodes) * self.obedience
 
     def as_dict(self) -> dict[str, float]:
         """Scalar figures, by name; `names` says which."""

@@ -123,6 +123,8 @@ def test_obedience_is_the_mean_reward_of_the_command_before_a_fall():
     np.testing.assert_allclose(played.obedience[~up], expected[0][~up], rtol=1e-5)
     found = evaluator.measure(played)
     assert found.obedience == pytest.approx(played.obedience.mean())
+    # A command says the pace itself, so the demonstration's does not count.
+    assert found.score == pytest.approx(up.mean() * found.obedience)
     assert set(found.as_dict()) == set(evaluate.names(trainer.config)) >= {"obedience", "score"}
     assert "obedience" in evaluate.table(found)
 

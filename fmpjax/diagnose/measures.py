@@ -10,7 +10,7 @@ TRAVELS = 0.15  # of the demonstration's speed, from which a policy travels
 STEPS = 0.5  # excursion from which the legs step
 STEADIEST = 0.3  # rad/s, the least turning rate that errors in turning are measured against
 DISTINCT = 0.1  # score spread from which the windows differ by more than the noise of one source bank
-GOOD = 0.3  # quality from which there is something to lose
+GOOD = 0.3  # quality or score from which there is something to lose
 
 
 def fallen(history: History) -> float:
@@ -106,11 +106,12 @@ def stamping(history: History) -> float | None:
 
 
 def kept(history: History) -> float | None:
-    """Quality of the history's newest evaluation over its best."""
-    found = [number("eval/quality", row.get("eval/quality")) for row in history.rows]
+    """Quality of the history's newest evaluation over its best; with a command the score."""
+    name = "eval/quality" if history.config.command.kind == "none" else "eval/score"
+    found = [number(name, row.get(name)) for row in history.rows]
     found = [value for value in found if not math.isnan(value)]
     if not found:
-        raise Missing("eval/quality")
+        raise Missing(name)
     return found[-1] / max(found) if max(found) >= GOOD else None
 
 

@@ -225,7 +225,7 @@ RULES = (
     Rule(
         "got worse",
         "The newest policy is much worse than the best one, which `best/` keeps",
-        "`eval/quality` of the newest evaluation over the best",
+        "`eval/quality` of the newest evaluation over the best; with a command `eval/score`",
         measures.kept,
         Range(low=0.25),
         ("ppo.target_kl", "evaluations"),

@@ -62,8 +62,10 @@ def history(method="fmp", settings=None, rows=12, **figures):
         assert section in training or name in evaluation or name == "expert_ranges", name
         (training if section in training else evaluation)[section if section in training else name] = value
     table = [dict(training) for _ in range(rows)]
-    table[-2]["eval/quality"], table[-1]["eval/quality"] = 0.8, evaluation["quality"]
-    return diagnose.History(table, preset("laptop", method=method, **(settings or {})), evaluation)
+    config = preset("laptop", method=method, **(settings or {}))
+    best = "eval/quality" if config.command.kind == "none" else "eval/score"
+    table[-2][best], table[-1][best] = 0.8, evaluation["quality"]
+    return diagnose.History(table, config, evaluation)
 
 
 # Each rule at the last healthy figure and just beyond it.
