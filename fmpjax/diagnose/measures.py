@@ -129,6 +129,12 @@ def nonfinite(history: History) -> float:
 
 
 def kl(history: History) -> float | None:
-    """KL divergence of the updates over its target."""
-    target = history.config.ppo.target_kl
-    return history["ppo/kl"] / target if target else None
+    """KL divergence of the updates over its target, which is another one where the policy settles."""
+    config = history.config
+    if not config.ppo.target_kl:
+        return None
+    begins = config.settles_at * config.transitions_per_iteration
+    settled = [row for row in history.rows[-RECENT:] if number("transitions", row.get("transitions")) > begins]
+    if config.ppo.settle and settled:
+        return history.mean("ppo/kl", settled) / config.ppo.settle_target_kl
+    return history["ppo/kl"] / config.ppo.target_kl

@@ -365,7 +365,7 @@ RULES = (
     Rule(
         "KL off its target",
         "The policy's updates are not of the size that is asked for",
-        "`ppo/kl` over `ppo.target_kl`",
+        "`ppo/kl` over `ppo.target_kl`, or over `ppo.settle_target_kl` where the policy settles",
         measures.kl,
         Range(0.5, 2.0),
         ("ppo.target_kl", "ppo.learning_rate"),

@@ -12,7 +12,7 @@ import pytest
 
 from fmpjax import cli, diagnose
 from fmpjax.config import flatten, preset, to_json
-from fmpjax.diagnose import rules, sentences
+from fmpjax.diagnose import measures, rules, sentences
 from fmpjax.errors import UserError
 from tests.helpers import ROOT
 
@@ -205,6 +205,17 @@ def test_a_demonstration_that_limps_may_be_followed():
 
 def test_without_a_target_the_divergence_is_not_judged():
     assert not diagnose.symptoms(history(ppo_kl=1.0, settings={"ppo.target_kl": 0.0}))
+
+
+def test_updates_of_a_policy_that_settles_have_another_target():
+    made = history(settings={"ppo.settle": 0.25, "transitions": 1_000_000})
+    for i, row in enumerate(made.rows):
+        row["transitions"] = 100_000 * (i - 1)
+        row["ppo/kl"] = 0.03 if row["transitions"] <= 750_000 else 0.008
+    assert measures.kl(made) == pytest.approx(1.0) and not diagnose.symptoms(made)
+    for row in made.rows:
+        row["ppo/kl"] = 0.03
+    assert len(diagnose.symptoms(made)) == 1
 
 
 def test_training_figures_are_means_of_the_last_rows_without_the_first():
