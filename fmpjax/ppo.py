@@ -154,6 +154,19 @@ class PPO:
         mean, deviation = part(normalizer.mean), part(normalizer.std)
         return learning.standardize(part(observation), mean, deviation, self.config.normalizer_clip)
 
+    def _sidedness(self, normalizer: RunningStatisticsState, observation: Any, image: jax.Array) -> jax.Array | float:
+        """How much states ``[...]`` count in the mirror loss: those that are their own mirror image do not.
+
+        Such a robot stands with its feet side by side. Asked for symmetric actions there, it lifts both heels at once
+        and falls; which foot steps first is for the policy to choose.
+        """
+        width = self.config.mirror_width
+        if not width:
+            return 1.0
+        apart = self._normalized(normalizer, image, of_actor) - self._normalized(normalizer, observation, of_actor)
+        square = jnp.mean(apart**2, axis=-1)
+        return square / (square + width**2)
+
     def policy(self, actor, normalizer: RunningStatisticsState, observation: Any) -> tuple[jax.Array, jax.Array]:
         """Mean and deviation ``[..., J]`` of the action distribution."""
         mean, deviation, _ = self._outputs(actor, normalizer, observation)
@@ -256,7 +269,8 @@ class PPO:
             if self.mirror is not None:
                 image = self.mirror.observation(of_actor(samples.observation))
                 other, _ = self.policy(params, state.normalizer, image)
-                off = jnp.mean(jnp.sum((other - self.mirror.action(mean)) ** 2, axis=-1))
+                off = jnp.sum((other - self.mirror.action(mean)) ** 2, axis=-1)
+                off = jnp.mean(off * self._sidedness(state.normalizer, samples.observation, image))
                 loss, stats = loss + config.mirror * off, stats | {"asymmetry": off}
             if self.estimated.size:
                 truth = self._normalized(state.normalizer, samples.observation, of_critic)[..., self.estimated]

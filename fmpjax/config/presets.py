@@ -161,9 +161,15 @@ COMMANDS: Mapping[str, Mapping[str, Any]] = {
         "env.axes": "heading",
         "features.axes": "heading",
         "env.last_cap": 500,  # falls of turns on the spot come after more than three seconds
+        "command.hold": (1.0, 5.0),  # also turns on the spot that last
         "command.ramp": (1.0, 1.0),  # no robot turns from a fast walk to a turn on the spot at once
         "ppo.settle": 0.2,  # policies of nearby iterations otherwise fall in 0.1 to 4 % of the episodes
         "ppo.mirror": 1.0,  # else a policy learns the turn to one side better than the other, and falls
+        "ppo.mirror_width": 0.3,  # who stands with both feet side by side has to choose one to start with
+        # Light pushes: a walk that becomes a turn on the spot goes through states that are rare without them.
+        "disturbance.push_interval": (2.0, 4.0),
+        "disturbance.push_speed": (0.0, 0.4),
+        "disturbance.push_turn": 0.5,
     },
     "phase": {
         "command.kind": "phase",
@@ -200,7 +206,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "smoke": _SMOKE,
     "laptop": _LAPTOP,
     "robust": _ROBUST,
-    "robot": _ROBUST | COMMANDS["velocity"],
+    "robot": COMMANDS["velocity"] | _ROBUST | {"command.kind": "velocity", "motion": "gaits", "env.last_cap": 500},
     "paper": {},
 }
 DESCRIPTIONS = {
