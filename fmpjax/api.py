@@ -58,7 +58,7 @@ def train(
             raise UserError(
                 "command and a Config were given: expected command.kind, motion and the axes to be set in the Config"
             )
-        run = _created(config, preset, folder, configuration.commanded(command, settings))
+        run = _created(config, preset, folder, configuration.commanded(command, settings, preset))
     left = None if minutes is None else minutes - (time.monotonic() - began) / 60
     if runs.train(run, resume=resume, minutes=left, logger=logger) is not runs.End.SIGNAL:
         runs.finish(run)

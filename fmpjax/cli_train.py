@@ -72,7 +72,7 @@ class Pretrain:
 
         named = {"robot": self.robot, "motion": self.motion, "frames": self.frames}
         changes = cli_settings.changes(self.settings, self.set, {**named, "method": self.method})
-        changes = configuration.commanded(self.command, changes)
+        changes = configuration.commanded(self.command, changes, self.preset)
         config = configuration.preset(self.preset or runs.default_preset(), **changes)
         config = configuration.with_changes(config, {"motion": library.listed(config.motion)})
         runs.check_trainable(config)
@@ -279,4 +279,4 @@ class Train:
         changes = cli_settings.changes(self.settings, self.set, named)
         if self.resume:
             return changes | ({} if self.command is None else {"command.kind": self.command})
-        return configuration.commanded(self.command, changes)
+        return configuration.commanded(self.command, changes, self.preset)

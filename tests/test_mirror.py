@@ -80,29 +80,43 @@ def test_a_policy_that_sees_less_than_the_critic_is_mirrored_too(walk):
     assert "ppo/asymmetry" in figures
 
 
-def test_an_update_teaches_both_sides_what_was_seen_on_one():
-    """A reward for actions above their mean, seen on one side alone: on the other side the mean falls as much."""
+def taught(state, weight, width):
+    """Changes of the mean action in states 0 and 1, each the other's mirror image, and the figures of an update.
+
+    It rewards actions above their mean in one ``state``, whose mirror image has its numbers swapped and an opposite
+    action.
+    """
     config = dataclasses.replace(
         tiny().ppo, hidden=(32,), rollout_steps=8, actor_epochs=8, learning_rate=1e-3, bound_penalty=0.0, deviation=0.3
     )
     swapped = mirror.Reflection(np.array([1, 0]), np.ones(2), np.zeros(2))
     opposite = mirror.Reflection(np.array([0]), np.array([-1.0]), np.zeros(1))
     noise = jax.random.normal(jax.random.PRNGKey(1), (8, 64, 1))
+    image = mirror.Mirror(swapped, opposite) if weight else None
+    ppo = PPO(2, 1, dataclasses.replace(config, mirror=weight, mirror_width=width), mirror=image)
+    start = ppo.init(jax.random.PRNGKey(0))
+    seen = jnp.broadcast_to(jnp.asarray(state, jnp.float32), (8, 64, 2))
+    mean, deviation = ppo.policy(start.actor, start.normalizer, seen)
+    never = jnp.zeros((8, 64), bool)
+    batch = Batch(seen, seen, mean + deviation * noise, mean, deviation, noise[..., 0], never, never)
+    after, figures = jax.jit(ppo.update)(start, batch, jax.random.PRNGKey(2))
+    states = jnp.array([state, state[::-1]], jnp.float32)
+    before, now = (ppo.policy(actor, start.normalizer, states)[0] for actor in (start.actor, after.actor))
+    return np.asarray(now - before)[:, 0], np.asarray(now)[:, 0], figures
 
-    def moved(weight):
-        image = mirror.Mirror(swapped, opposite) if weight else None
-        ppo = PPO(2, 1, dataclasses.replace(config, mirror=weight), mirror=image)
-        state = ppo.init(jax.random.PRNGKey(0))
-        seen = jnp.broadcast_to(jnp.array([1.0, 0.0]), (8, 64, 2))
-        mean, deviation = ppo.policy(state.actor, state.normalizer, seen)
-        never = jnp.zeros((8, 64), bool)
-        batch = Batch(seen, seen, mean + deviation * noise, mean, deviation, noise[..., 0], never, never)
-        after, figures = jax.jit(ppo.update)(state, batch, jax.random.PRNGKey(2))
-        before, now = (ppo.policy(actor, state.normalizer, jnp.eye(2))[0] for actor in (state.actor, after.actor))
-        return np.asarray(now - before)[:, 0], figures
 
-    (alone, plain), (shared, figures) = moved(0.0), moved(100.0)
+@pytest.mark.parametrize("width", [0.0, 0.3])
+def test_an_update_teaches_both_sides_what_was_seen_on_one(width):
+    """A reward for actions above their mean, seen on one side alone: on the other side the mean falls as much."""
+    (alone, _, plain), (shared, _, figures) = (taught([1.0, 0.0], weight, width) for weight in (0.0, 100.0))
     assert alone[0] > 0.01 and shared[0] > 0.01
     assert shared[1] < -0.5 * shared[0]
     assert alone[1] > -0.5 * alone[0]
     assert "asymmetry" not in plain and 0 < float(figures["asymmetry"]) < 1e-3
+
+
+def test_a_symmetric_state_may_choose_a_side():
+    """What is its own mirror image must have an action that is its own, unless such states do not count."""
+    (_, held, _), (moved, _, figures) = (taught([1.0, 1.0], 100.0, width) for width in (0.0, 0.3))
+    assert np.abs(held).max() < 0.005
+    assert moved.min() > 0.01 and float(figures["asymmetry"]) == 0.0

@@ -185,12 +185,13 @@ COMMANDS: Mapping[str, Mapping[str, Any]] = {
 _FOLLOWING = COMMANDS["phase"] | {"command.combine": "prior"}
 
 
-def commanded(kind: str | None, changes: Mapping[str, Any]) -> dict[str, Any]:
+def commanded(kind: str | None, changes: Mapping[str, Any], preset: str | None = None) -> dict[str, Any]:
     """Changes of the settings with those that go with a command; what is changed itself stays.
 
     Args:
       kind: of command; None leaves the command as it is.
       changes: by ``section.field`` keys.
+      preset: that is changed; one that pushes keeps its own pushes.
 
     Raises:
       UserError: the kind is unknown.
@@ -199,7 +200,10 @@ def commanded(kind: str | None, changes: Mapping[str, Any]) -> dict[str, Any]:
         return dict(changes)
     if kind not in COMMANDS:
         raise UserError(f"command is {kind!r}: expected one of {', '.join(COMMANDS)}")
-    return {**COMMANDS[kind], **changes}
+    implied = COMMANDS[kind]
+    if PRESETS.get(preset or "", {}).get("disturbance.push_interval"):
+        implied = {key: value for key, value in implied.items() if not key.startswith("disturbance.push_")}
+    return {**implied, **changes}
 
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {

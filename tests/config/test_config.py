@@ -214,6 +214,14 @@ def test_a_meaning_is_the_comment_of_the_class_that_sets_the_default():
     assert known["prior.updates"].values == {"paper": 128, "robot": 3, "robust": 3, "laptop": 3, "smoke": 2}
 
 
+def test_a_preset_that_pushes_keeps_its_pushes_with_a_velocity_command():
+    for name, speed in (("laptop", (0.0, 0.4)), ("robust", (0.0, 1.0)), (None, (0.0, 0.4))):
+        changes = configuration.commanded("velocity", {"seed": 3}, name)
+        made = configuration.preset(name or "laptop", **changes)
+        assert made.disturbance.push_speed == speed and made.disturbance.push_interval and made.seed == 3
+    assert configuration.preset("robot").disturbance == configuration.preset("robust").disturbance
+
+
 def test_a_section_or_a_setting_is_explained(capsys):
     cli.main(["settings", "pwil"])
     printed = capsys.readouterr().out
