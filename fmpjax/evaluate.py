@@ -102,7 +102,10 @@ class Evaluation:
 
     @property
     def score(self) -> float:
-        """What "best" means: the quality; with a command, which says the pace, the surviving share times obedience."""
+        """What "best" means: the quality; with a command the surviving share times the obedience.
+
+        A command says what is wanted, which need not be the demonstration's pace.
+        """
         return self.quality if self.obedience is None else (1.0 - self.falls / self.episodes) * self.obedience
 
     def as_dict(self) -> dict[str, float]:

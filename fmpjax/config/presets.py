@@ -165,7 +165,7 @@ COMMANDS: Mapping[str, Mapping[str, Any]] = {
         "command.ramp": (1.0, 1.0),  # no robot turns from a fast walk to a turn on the spot at once
         "ppo.settle": 0.2,  # policies of nearby iterations otherwise fall in 0.1 to 4 % of the episodes
         "ppo.mirror": 1.0,  # else a policy learns the turn to one side better than the other, and falls
-        "ppo.mirror_width": 0.3,  # who stands with both feet side by side has to choose one to start with
+        "ppo.mirror_width": 0.3,  # a robot whose feet are side by side must choose which one steps first
         # Light pushes: a walk that becomes a turn on the spot goes through states that are rare without them.
         "disturbance.push_interval": (2.0, 4.0),
         "disturbance.push_speed": (0.0, 0.4),
@@ -191,7 +191,7 @@ def commanded(kind: str | None, changes: Mapping[str, Any], preset: str | None =
     Args:
       kind: of command; None leaves the command as it is.
       changes: by ``section.field`` keys.
-      preset: that is changed; one that pushes keeps its own pushes.
+      preset: its name, None for the default. Pushes of its own, or of ``changes``, replace those of the command.
 
     Raises:
       UserError: the kind is unknown.
@@ -200,17 +200,23 @@ def commanded(kind: str | None, changes: Mapping[str, Any], preset: str | None =
         return dict(changes)
     if kind not in COMMANDS:
         raise UserError(f"command is {kind!r}: expected one of {', '.join(COMMANDS)}")
-    implied = COMMANDS[kind]
-    if PRESETS.get(preset or "", {}).get("disturbance.push_interval"):
-        implied = {key: value for key, value in implied.items() if not key.startswith("disturbance.push_")}
-    return {**implied, **changes}
+    pushed = PRESETS.get(preset or "", {}).get("disturbance.push_interval") or any(map(_pushes, changes))
+    return {**(_unpushed(COMMANDS[kind]) if pushed else COMMANDS[kind]), **changes}
+
+
+def _pushes(key: str) -> bool:
+    return key.startswith("disturbance.push_")
+
+
+def _unpushed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in settings.items() if not _pushes(key)}
 
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "smoke": _SMOKE,
     "laptop": _LAPTOP,
     "robust": _ROBUST,
-    "robot": COMMANDS["velocity"] | _ROBUST | {"command.kind": "velocity", "motion": "gaits", "env.last_cap": 500},
+    "robot": _ROBUST | _unpushed(COMMANDS["velocity"]),
     "paper": {},
 }
 DESCRIPTIONS = {

@@ -251,7 +251,7 @@ class PPOConfig(Section):
     # weight of the squared difference between the mean action in a mirrored state and the mirrored mean action [D]
     mirror: NonNegativeFloat = 0.0
     # distance of a state from its own mirror image, rms over the normalized observation, at which it counts half in
-    # this loss, so that a symmetric state may choose a side; 0: all states count alike [D]
+    # the mirror loss, so that a symmetric state may choose a side; 0: all states count alike [D]
     mirror_width: NonNegativeFloat = 0.0
 
     def check(self) -> None:

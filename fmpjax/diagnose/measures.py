@@ -133,8 +133,9 @@ def kl(history: History) -> float | None:
     config = history.config
     if not config.ppo.target_kl:
         return None
-    begins = config.settles_at * config.transitions_per_iteration
-    settled = [row for row in history.rows[-RECENT:] if number("transitions", row.get("transitions")) > begins]
+    # A row is of the iterations since the one before: the first that ends here may have begun earlier.
+    begins = (config.settles_at + config.chunk) * config.transitions_per_iteration
+    settled = [row for row in history.rows[-RECENT:] if number("transitions", row.get("transitions")) >= begins]
     if config.ppo.settle and settled:
         return history.mean("ppo/kl", settled) / config.ppo.settle_target_kl
     return history["ppo/kl"] / config.ppo.target_kl

@@ -48,7 +48,8 @@ class Recorder:
         mirror = Mirror(logger, run.folder, configuration.flatten(run.config)) if logger and keep else None
         self.log = MetricsLog(run.folder, list(columns), iteration, keep=keep, mirror=mirror)
         rows = [row for row in self.log.rows if row.get("eval/quality")]
-        # Rows of earlier versions have no score with a command: the next policy replaces theirs.
+        # With a command, rows of earlier versions have no score, or one that the pace made lower: the next policy
+        # replaces theirs.
         name = "eval/quality" if config.command.kind == "none" else "eval/score"
         self.best = max((float(row[name]) for row in rows if row.get(name)), default=-1.0)  # score of the best policy
         self.evaluated = max((int(row["iteration"]) for row in rows), default=0)  # the last iteration evaluated

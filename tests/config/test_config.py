@@ -220,6 +220,8 @@ def test_a_preset_that_pushes_keeps_its_pushes_with_a_velocity_command():
         made = configuration.preset(name or "laptop", **changes)
         assert made.disturbance.push_speed == speed and made.disturbance.push_interval and made.seed == 3
     assert configuration.preset("robot").disturbance == configuration.preset("robust").disturbance
+    own = configuration.commanded("velocity", {"disturbance.push_interval": (1.0, 3.0)})
+    assert configuration.preset("laptop", **own).disturbance.push_turn == 0.0
 
 
 def test_a_section_or_a_setting_is_explained(capsys):
