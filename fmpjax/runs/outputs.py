@@ -71,7 +71,8 @@ def export(run: Run, out: Path, *, onnx: bool = False, best: bool = True) -> lis
     """Copy what a run has to show, and its policy, without states and demonstration, into ``out``; the paths written.
 
     With ``onnx`` the policy is also written for other programs, as `fmpjax.deploy` does it. Without ``best`` policy and
-    figures are the newest ones, and films, which are of the best policy, are left out.
+    figures are the newest ones, and films, which are of the best policy, are left out. Films and figures of another
+    policy of the run, which an earlier export wrote there, are removed.
 
     Raises:
       UserError: ``out`` holds another run's results, or cannot be written, or there is no policy for ``onnx``.
@@ -94,7 +95,10 @@ def export(run: Run, out: Path, *, onnx: bool = False, best: bool = True) -> lis
         for n, text in texts.items():
             write(out / n, text)
         shown = {n: n for n in (*_CURVES, *(_FILMS if best else ()))} | {n: _name(n, best) for n in _FIGURES}
-        copied = [Path(shutil.copy2(run.folder / n, out / to)) for to, n in shown.items() if (run.folder / n).exists()]
+        shown = {to: n for to, n in shown.items() if (run.folder / n).exists()}
+        copied = [Path(shutil.copy2(run.folder / n, out / to)) for to, n in shown.items()]
+        for name in {*_FILMS, *_FIGURES} - {*shown}:
+            (out / name).unlink(missing_ok=True)
         if trained:
             trainer, state = run.policy(best=best)
             learned = policy.of(trainer, state.ppo)
