@@ -424,7 +424,7 @@ def test_a_run_is_told_velocities_and_measured(told, capsys, monkeypatch):
     for name, seconds in {"CONSTANT": 1.0, "SETTLING": 0.2, "LEG": 0.4, "FOLLOWING": 0.1}.items():
         monkeypatch.setattr(steering, name, seconds)
     trainer, state = runs.Run.open(told).policy()
-    assert trainer.env.observation_size == 92 and state.env.command.value.shape == (8, 3)
+    assert trainer.env.observation_size.actor == 92 and state.env.command.value.shape == (8, 3)
     rows = (told / "metrics.csv").read_text().splitlines()
     assert "command/reward" in rows[0]
     cli.main(["evaluate", str(told), "--commands", "--episodes", "4"])

@@ -424,6 +424,8 @@ def test_the_first_steps_are_those_of_training(trained, robot, tmp_path, edit):
 
     def edited(root):
         root.find("default").find("joint").set("frictionloss", str(friction))
+        # Of joint friction the solver's few iterations leave an error, which depends on where they start.
+        ElementTree.SubElement(root.find("option"), "flag", warmstart="disable", island="disable")
         edit(root)
 
     sim = sim2sim.Simulation(sim2sim.load(trained.path), mjcf(robot, tmp_path / "g1.xml", edited, **trained.options))
