@@ -93,8 +93,10 @@ def physics_alone(trainer, state) -> Part:
     sim, targets = jax.jit(jax.vmap(visited, out_axes=1) if seeds else visited)(state)
     sim, targets = jax.tree.map(lambda x: x.reshape(steps, -1, x.shape[-1]), (sim, targets))
     if not isinstance(backend, NativePhysics):
-        # What a step reaches must be used, or the compiler leaves the step out.
-        each = lambda total, now: (total + backend.step(*now).qvel, None)  # noqa: E731
+
+        def each(total, now):
+            return total + backend.step(*now).qvel, None  # what a step reaches must be used, or it is left out
+
         return part(lambda *now: jax.lax.scan(each, jnp.zeros_like(now[0].qvel[0]), now)[0], sim, targets)
     qpos, qvel, targets = (np.asarray(x, np.float64).reshape(-1, x.shape[-1]) for x in (sim.qpos, sim.qvel, targets))
     initial = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)

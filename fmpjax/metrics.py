@@ -368,6 +368,11 @@ def pace_of(figures: Mapping[str, Any]) -> float:
     return figures["path_speed" if figures["demonstration_turning"] > TURNS else "late_speed"]
 
 
+def choosing(command: str) -> str:
+    """The figure of an evaluation whose highest value chooses ``best/``, in runs with a kind of command."""
+    return "eval/quality" if command == "none" else "eval/score"
+
+
 def pace_error(figures: Mapping[str, Any]) -> float:
     """Relative error of an evaluation's pace; 1, as of a robot that stands, where no episode lasts so long."""
     late = pace_of(figures)

@@ -117,6 +117,16 @@ def test_an_update_teaches_both_sides_what_was_seen_on_one(width):
 
 def test_a_symmetric_state_may_choose_a_side():
     """What is its own mirror image must have an action that is its own, unless such states do not count."""
-    (_, held, _), (moved, _, figures) = (taught([1.0, 1.0], 100.0, width) for width in (0.0, 0.3))
+    (_, held, _), (change, _, figures) = (taught([1.0, 1.0], 100.0, width) for width in (0.0, 0.3))
     assert np.abs(held).max() < 0.005
-    assert moved.min() > 0.01 and float(figures["asymmetry"]) == 0.0
+    assert change.min() > 0.01 and float(figures["asymmetry"]) == 0.0
+
+
+@pytest.mark.parametrize(("distance", "share"), [(0.0, 0.0), (0.15, 0.2), (0.3, 0.5), (0.6, 0.8)])
+def test_a_state_counts_in_the_mirror_loss_by_its_distance_from_its_image(distance, share):
+    """Half at the width: d² / (d² + width²), with d the root mean square over the normalized observation."""
+    ppo = PPO(2, 1, dataclasses.replace(tiny().ppo, mirror_width=0.3))
+    normalizer = ppo.init(jax.random.PRNGKey(0)).normalizer
+    seen = normalizer.mean + normalizer.std * jnp.array([[0.5, -0.5]])
+    image = seen + normalizer.std * distance
+    np.testing.assert_allclose(ppo._sidedness(normalizer, seen, image), [share], atol=1e-5)

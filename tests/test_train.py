@@ -207,14 +207,15 @@ def test_an_export_carries_the_newest_policy_with_its_own_figures(trained, tmp_p
     (run.folder / "evaluation-last.json").write_text(json.dumps({"falls": 3}))
     for name in ("frames.png", "robustness.json"):
         (run.folder / name).write_text("{}")
-    # What an earlier export shows of the best policy does not stay beside the newest one.
+    # What an earlier export shows of the best policy does not stay beside the newest one; other files do.
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "course.mp4").write_text("mine")
+    runs.export(run, tmp_path / "mine", best=False)
+    assert (tmp_path / "mine" / "course.mp4").read_text() == "mine"
     for options in ([], ["--last"]):
         cli.main(["export", str(run.folder), str(tmp_path / "out"), *options])
-        assert (
-            (tmp_path / "out" / "frames.png").exists()
-            == (tmp_path / "out" / "robustness.json").exists()
-            == (not options)
-        )
+        left = [(tmp_path / "out" / name).exists() for name in ("frames.png", "robustness.json")]
+        assert left == [not options] * 2
     trainer, state = run.policy(best=False)
     observations = trainer.env.clip_observations[:5]
     actions, _ = trainer.ppo.act(state.ppo, deterministic=True)(observations, None)

@@ -191,7 +191,8 @@ def commanded(kind: str | None, changes: Mapping[str, Any], preset: str | None =
     Args:
       kind: of command; None leaves the command as it is.
       changes: by ``section.field`` keys.
-      preset: its name, None for the default. Pushes of its own, or of ``changes``, replace those of the command.
+      preset: its name, None for the default. Its own pushes, or a ``push_interval`` in ``changes``, replace those of
+        the command.
 
     Raises:
       UserError: the kind is unknown.
@@ -200,16 +201,12 @@ def commanded(kind: str | None, changes: Mapping[str, Any], preset: str | None =
         return dict(changes)
     if kind not in COMMANDS:
         raise UserError(f"command is {kind!r}: expected one of {', '.join(COMMANDS)}")
-    pushed = PRESETS.get(preset or "", {}).get("disturbance.push_interval") or any(map(_pushes, changes))
+    pushed = PRESETS.get(preset or "", {}).get("disturbance.push_interval") or "disturbance.push_interval" in changes
     return {**(_unpushed(COMMANDS[kind]) if pushed else COMMANDS[kind]), **changes}
 
 
-def _pushes(key: str) -> bool:
-    return key.startswith("disturbance.push_")
-
-
 def _unpushed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in settings.items() if not _pushes(key)}
+    return {key: value for key, value in settings.items() if not key.startswith("disturbance.push_")}
 
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {

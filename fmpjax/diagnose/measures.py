@@ -3,7 +3,7 @@
 import math
 
 from fmpjax.diagnose.history import RECENT, History, Missing, number
-from fmpjax.metrics import TURNS
+from fmpjax.metrics import TURNS, choosing
 
 MOVES = 0.1  # m/s, from which a demonstration moves
 TRAVELS = 0.15  # of the demonstration's speed, from which a policy travels
@@ -107,7 +107,7 @@ def stamping(history: History) -> float | None:
 
 def kept(history: History) -> float | None:
     """Quality of the history's newest evaluation over its best; with a command the score."""
-    name = "eval/quality" if history.config.command.kind == "none" else "eval/score"
+    name = choosing(history.config.command.kind)
     found = [number(name, row.get(name)) for row in history.rows]
     found = [value for value in found if not math.isnan(value)]
     if not found:

@@ -88,7 +88,8 @@ def export(run: Run, out: Path, *, onnx: bool = False, best: bool = True) -> lis
     texts = {"config.json": (run.folder / "config.json").read_text().rstrip("\n")}
     texts["provenance.json"] = jsons.dumps(run.provenance())
     texts = {n: without_places(text, places) for n, text in texts.items()}
-    if (out / "config.json").exists() and (out / "config.json").read_text().rstrip("\n") != texts["config.json"]:
+    again = (out / "config.json").exists()
+    if again and (out / "config.json").read_text().rstrip("\n") != texts["config.json"]:
         raise UserError(f"{out} holds results of another configuration: expected a new folder or this run's own")
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -97,8 +98,9 @@ def export(run: Run, out: Path, *, onnx: bool = False, best: bool = True) -> lis
         shown = {n: n for n in (*_CURVES, *(_FILMS if best else ()))} | {n: _name(n, best) for n in _FIGURES}
         shown = {to: n for to, n in shown.items() if (run.folder / n).exists()}
         copied = [Path(shutil.copy2(run.folder / n, out / to)) for to, n in shown.items()]
-        for name in {*_FILMS, *_FIGURES} - {*shown}:
-            (out / name).unlink(missing_ok=True)
+        if again:  # else a file of such a name is somebody else's
+            for name in {*_FILMS, *_FIGURES} - {*shown}:
+                (out / name).unlink(missing_ok=True)
         if trained:
             trainer, state = run.policy(best=best)
             learned = policy.of(trainer, state.ppo)

@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 
 from fmpjax import config as configuration
-from fmpjax import diagnose
+from fmpjax import diagnose, metrics
 from fmpjax.config import Config
 from fmpjax.evaluate import Evaluation, table
 from fmpjax.logs import MetricsLog, Mirror, clock
@@ -50,7 +50,7 @@ class Recorder:
         rows = [row for row in self.log.rows if row.get("eval/quality")]
         # With a command, rows of earlier versions have no score, or one that the pace made lower: the next policy
         # replaces theirs.
-        name = "eval/quality" if config.command.kind == "none" else "eval/score"
+        name = metrics.choosing(config.command.kind)
         self.best = max((float(row[name]) for row in rows if row.get(name)), default=-1.0)  # score of the best policy
         self.evaluated = max((int(row["iteration"]) for row in rows), default=0)  # the last iteration evaluated
 

@@ -222,6 +222,8 @@ def test_a_preset_that_pushes_keeps_its_pushes_with_a_velocity_command():
     assert configuration.preset("robot").disturbance == configuration.preset("robust").disturbance
     own = configuration.commanded("velocity", {"disturbance.push_interval": (1.0, 3.0)})
     assert configuration.preset("laptop", **own).disturbance.push_turn == 0.0
+    harder = configuration.commanded("velocity", {"disturbance.push_speed": (0.0, 0.6)})
+    assert configuration.preset("laptop", **harder).disturbance.push_interval == (2.0, 4.0)
 
 
 def test_a_section_or_a_setting_is_explained(capsys):
