@@ -248,15 +248,15 @@ class Observed(NamedTuple):
 
 def _turned(p: _Parts) -> _Parts:
     """The same in axes of which x points where the root faces."""
-    forward = p.rotation[..., :2]
-    cosine, sine = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
-
-    def turn(vectors):
-        x, y, z = (vectors[..., i::3] for i in range(3))
-        return jnp.stack([x * cosine + y * sine, y * cosine - x * sine, z], axis=-1).reshape(vectors.shape)
-
     names = ("rotation", "velocity", "angular_velocity", "key_points")
-    return p._replace(**{name: turn(getattr(p, name)) for name in names})
+    return p._replace(**{name: _along(p.rotation[..., :2], getattr(p, name)) for name in names})
+
+
+def _along(forward: jax.Array, vectors: jax.Array) -> jax.Array:
+    """Vectors ``[..., 3 n]`` in axes of which x points along ``forward [..., 2]`` and z stays."""
+    cosine, sine = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
+    x, y, z = (vectors[..., i::3] for i in range(3))
+    return jnp.stack([x * cosine + y * sine, y * cosine - x * sine, z], axis=-1).reshape(vectors.shape)
 
 
 @partial(jax.jit, static_argnames=("robot", "form"), inline=True)
@@ -301,39 +301,24 @@ def compact_weights(robot: Robot) -> Float[np.ndarray, " F"]:
     return weights
 
 
-class _Planar(NamedTuple):
-    """Where the x and y of a compact frame's vectors are."""
-
-    other: np.ndarray  # [F] int, of an x its y and of a y its x
-    sign: np.ndarray  # [F] 1 for an x, -1 for a y, 0 for what does not turn with the heading
-
-
-def _planar(robot: Robot) -> _Planar:
-    layout = FrameLayout.of(robot)
-    vectors = layout.root, layout.rotation, layout.key_points, layout.velocity, layout.angular_velocity
-    x = np.concatenate([np.arange(part.start, part.stop, 3) for part in vectors])
-    other, sign = np.arange(layout.size), np.zeros(layout.size, np.float32)
-    other[x], other[x + 1] = x + 1, x
-    sign[x], sign[x + 1] = 1.0, -1.0
-    return _Planar(other, sign)
-
-
-def turned_windows(windows: Float[jax.Array, "*batch H F"], planar: _Planar) -> Float[jax.Array, "*batch H F"]:
+def turned_windows(windows: Float[jax.Array, "*batch H F"], layout: FrameLayout) -> Float[jax.Array, "*batch H F"]:
     """Relative windows ``[..., H, F]`` in axes of which x points where the newest frame's root does."""
     forward = windows[..., -1:, FORWARD]
-    cosine, sine = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
-    turned = windows * cosine + windows[..., planar.other] * planar.sign * sine
-    return jnp.where(planar.sign == 0, windows, turned)
+    parts = {name: windows[..., part] for name, part in layout._asdict().items()}
+    for name in ("root", "rotation", "key_points", "velocity", "angular_velocity"):
+        parts[name] = _along(forward, parts[name])
+    return FrameLayout.join(**parts)
 
 
 def in_own_heading(robot: Robot, frames: Float[jax.Array, "*batch F"]) -> Float[jax.Array, "*batch F"]:
     """Compact frames ``[..., F]`` in axes of which x points where each frame's root does."""
-    return turned_windows(frames[..., None, :], _planar(robot))[..., 0, :]
+    return turned_windows(frames[..., None, :], FrameLayout.of(robot))[..., 0, :]
 
 
 def relative_windows(frames: Float[jax.Array, "*batch H F"]) -> Float[jax.Array, "*batch H F"]:
     """Windows ``[..., H, F]`` of compact frames with x and y made relative to the newest frame."""
-    return frames.at[..., PLANAR].add(-frames[..., -1:, PLANAR])
+    planar, rest = frames[..., PLANAR], frames[..., PLANAR.stop :]
+    return jnp.concatenate([planar - planar[..., -1:, :], rest], axis=-1)
 
 
 class FeatureMap(NamedTuple):
@@ -348,17 +333,17 @@ class FeatureMap(NamedTuple):
     weight: jax.Array  # [F], multiplicity over sqrt(d)
     clip: jax.Array  # scalar
     dimension: jax.Array  # scalar, d
-    planar: _Planar | None = None  # set where windows are turned to their own heading
+    turned: FrameLayout | None = None  # set where windows are turned to their own heading
 
     def __call__(self, frames: Float[jax.Array, "*batch H F"]) -> Float[jax.Array, "*batch D"]:
         """Features ``[..., H * F]`` of windows of compact frames ``[..., H, F]``, absolute or relative."""
-        z = (_placed(frames, self.planar) - self.mean) / self.deviation
+        z = (_placed(frames, self.turned) - self.mean) / self.deviation
         x = jnp.clip(z, -self.clip, self.clip) * self.weight
         return x.reshape(*x.shape[:-2], -1)
 
     def placed(self, frames: Float[jax.Array, "*batch F"]) -> Float[jax.Array, "*batch F"]:
         """Single frames ``[..., F]`` as the newest of a window: x and y are 0, and vectors are in the map's axes."""
-        return _placed(frames[..., None, :], self.planar)[..., 0, :]
+        return _placed(frames[..., None, :], self.turned)[..., 0, :]
 
     def unclipped(self) -> "FeatureMap":
         """The same map without the clip, for a prior that normalizes and clips windows itself."""
@@ -373,11 +358,11 @@ def fit_feature_map(
 ) -> FeatureMap:
     """Feature map from the demonstrations' windows of compact frames ``[W, H, F]``, weighed by ``share [W]``."""
     dimension = config.history * frame_size(robot)
-    planar = _planar(robot) if config.axes == "heading" else None
-    relative = np.asarray(_placed(windows, planar), np.float64)
+    layout = FrameLayout.of(robot)
+    turned = layout if config.axes == "heading" else None
+    relative = np.asarray(_placed(windows, turned), np.float64)
     mean = relative.mean(0) if share is None else np.average(relative, axis=0, weights=share)
     deviation = np.sqrt(np.average((relative - mean) ** 2, axis=0, weights=share))
-    layout = FrameLayout.of(robot)
     floor = np.full(layout.size, config.deviation_floor)
     floor[layout.angular_velocity] = floor[layout.joint_velocity] = config.angular_velocity_floor
     return FeatureMap(
@@ -386,10 +371,10 @@ def fit_feature_map(
         weight=jnp.asarray(compact_weights(robot) / np.sqrt(dimension), jnp.float32),
         clip=jnp.float32(config.clip),
         dimension=jnp.float32(dimension),
-        planar=planar,
+        turned=turned,
     )
 
 
-def _placed(frames: jax.Array, planar: _Planar | None) -> jax.Array:
+def _placed(frames: jax.Array, turned: FrameLayout | None) -> jax.Array:
     relative = relative_windows(frames)
-    return relative if planar is None else turned_windows(relative, planar)
+    return relative if turned is None else turned_windows(relative, turned)

@@ -154,18 +154,22 @@ class PPO:
         mean, deviation = part(normalizer.mean), part(normalizer.std)
         return learning.standardize(part(observation), mean, deviation, self.config.normalizer_clip)
 
-    def _sidedness(self, normalizer: RunningStatisticsState, observation: Any, image: jax.Array) -> jax.Array | float:
-        """How much states ``[...]`` count in the mirror loss: those that are their own mirror image do not.
+    def _mirrored(self, normalizer: RunningStatisticsState, observation: Any) -> tuple[jax.Array, jax.Array] | None:
+        """Mirror images of observations ``[M, O]``, and how much each counts in the mirror loss ``[M]``.
 
-        Such a robot stands with its feet side by side. Asked for symmetric actions there, it lifts both heels at once
-        and falls; which foot steps first is for the policy to choose.
+        States that are their own mirror image do not. Such a robot stands with its feet side by side. Asked for
+        symmetric actions there, it lifts both heels at once and falls; which foot steps first is for the policy to
+        choose.
         """
-        width = self.config.mirror_width
+        if self.mirror is None:
+            return None
+        seen, width = of_actor(observation), self.config.mirror_width
+        image = self.mirror.observation(seen)
         if not width:
-            return 1.0
-        apart = self._normalized(normalizer, image, of_actor) - self._normalized(normalizer, observation, of_actor)
+            return image, jnp.ones(image.shape[:-1], image.dtype)
+        apart = self._normalized(normalizer, image, of_actor) - self._normalized(normalizer, seen, of_actor)
         square = jnp.mean(apart**2, axis=-1)
-        return square / (square + width**2)
+        return image, square / (square + width**2)
 
     def policy(self, actor, normalizer: RunningStatisticsState, observation: Any) -> tuple[jax.Array, jax.Array]:
         """Mean and deviation ``[..., J]`` of the action distribution."""
@@ -232,11 +236,13 @@ class PPO:
         spread = jnp.maximum(advantage.std(), 1e-5)
         gain = jnp.clip((advantage - advantage.mean()) / spread, -config.advantage_clip, config.advantage_clip)
         return_variance = returns.var()
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), sharding.gather((batch, returns, gain)))
+        whole = sharding.gather((batch, returns, gain))
+        flat, targets, gains = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), whole)
+        mirrored = self._mirrored(state.normalizer, flat.observation)
         critic_key, actor_key = jax.random.split(key)
 
         def critic_loss(params, sample):
-            samples, target, _ = sample
+            samples, target = sample
             age = None if samples.age is None else samples.age - 1
             error = self._values(params, state.normalizer, samples.observation, age) - target
             # Adam with a clipped norm needs a loss of order one; plain SGD takes MimicKit's loss as it is.
@@ -244,18 +250,16 @@ class PPO:
             return scale * jnp.mean(error**2), {}
 
         critic, critic_optimizer, critic_stats = self._epochs(
-            critic_loss, state.critic, state.critic_optimizer, state.rate, flat, critic_key,
+            critic_loss, state.critic, state.critic_optimizer, state.rate, (flat, targets), critic_key,
             config.critic_epochs, config.critic_batch,
         )  # fmt: skip
 
         def actor_loss(params, sample):
-            samples, _, gain = sample
+            samples, gain, mirrored = sample
             mean, deviation, estimate = self._outputs(params, state.normalizer, samples.observation)
             new, old = (mean, deviation), (samples.mean, samples.deviation)
-            log_ratio = self._distribution.log_prob(new, samples.action) - self._distribution.log_prob(
-                old, samples.action
-            )
-            ratio = jnp.exp(log_ratio)
+            log_prob = self._distribution.log_prob
+            ratio = jnp.exp(log_prob(new, samples.action) - log_prob(old, samples.action))
             clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
             surrogate = -jnp.mean(jnp.minimum(ratio * gain, clipped * gain))
             bound = jnp.mean(jnp.sum(jnp.maximum(jnp.abs(mean) - 1.0, 0.0) ** 2, axis=-1))
@@ -267,10 +271,9 @@ class PPO:
             }
             loss = surrogate + config.bound_penalty * bound
             if self.mirror is not None:
-                image = self.mirror.observation(of_actor(samples.observation))
+                image, weight = mirrored
                 other, _ = self.policy(params, state.normalizer, image)
-                off = jnp.sum((other - self.mirror.action(mean)) ** 2, axis=-1)
-                off = jnp.mean(off * self._sidedness(state.normalizer, samples.observation, image))
+                off = jnp.mean(weight * jnp.sum((other - self.mirror.action(mean)) ** 2, axis=-1))
                 loss, stats = loss + config.mirror * off, stats | {"asymmetry": off}
             if self.estimated.size:
                 truth = self._normalized(state.normalizer, samples.observation, of_critic)[..., self.estimated]
@@ -279,7 +282,7 @@ class PPO:
             return loss, stats
 
         actor, actor_optimizer, actor_stats = self._epochs(
-            actor_loss, state.actor, state.actor_optimizer, state.rate, flat, actor_key,
+            actor_loss, state.actor, state.actor_optimizer, state.rate, (flat, gains, mirrored), actor_key,
             config.actor_epochs, config.actor_batch,
         )  # fmt: skip
         if config.learn_deviation:

@@ -22,6 +22,8 @@ CONSTANT = 10.0  # s, of an episode under one command
 SETTLING = 2.0  # s at its start that do not count
 LEG, LEGS = 3.0, 7  # s under each of an episode's changing commands, and their number
 FOLLOWING = 1.0  # s at the start of each that do not count
+NEAR = 0.02  # m/s and rad/s summed over the three, by which starts may be further from a command than the nearest
+STARTS = 25  # samples of the demonstrations, at least, from which the starts under a command are drawn
 ZERO = 0.1  # share of the changing commands that are zero
 
 
@@ -162,11 +164,18 @@ def play(trainer: Trainer, state: PPOState, told: np.ndarray, rng: np.random.Gen
     """
     told = velocity.ramped(told, trainer.config.command.ramp, trainer.config.control_rate)
     table = np.concatenate([velocity.velocities(clip) for clip in trainer.env.library.clips])
-    rows = []
-    for command in told[0]:
-        distance = np.abs(table - command).sum(-1)
-        rows.append(rng.choice(np.flatnonzero(distance <= distance.min() + 0.02)))
+    rows = [rng.choice(nearest_rows(table, command)) for command in told[0]]
     return Played(*map(np.asarray, _play(trainer, state, jnp.asarray(rows), jnp.asarray(told, jnp.float32))))
+
+
+def nearest_rows(table: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """The rows of velocities ``table [R, 3]`` nearest to a command ``[3]``: all within `NEAR`, `STARTS` at least.
+
+    A recording may have a single sample so near. Episodes that all begin there would all be the same.
+    """
+    distance = np.abs(table - command).sum(-1)
+    last = np.sort(distance)[min(STARTS, len(table)) - 1]
+    return np.flatnonzero(distance <= max(distance.min() + NEAR, last))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -265,7 +265,7 @@ def test_heading_axes_ignore_which_way_the_window_goes(robot, walk):
     # What a heading does not touch is what it was; the newest frame looks along x.
     start = FrameLayout.of(robot).velocity.start
     unturned = np.r_[2, 5, 8, 9:67, start + 2, start + 5, start + 6 : plain.shape[-1]]
-    placed = features.turned_windows(features.relative_windows(turned), own.planar)
+    placed = features.turned_windows(features.relative_windows(turned), own.turned)
     np.testing.assert_array_equal(placed[..., unturned], turned[..., unturned])
     np.testing.assert_allclose(placed[:, -1, 4], 0, atol=1e-6)
     assert (placed[:, -1, 3] > 0.9).all()

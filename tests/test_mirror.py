@@ -128,5 +128,8 @@ def test_a_state_counts_in_the_mirror_loss_by_its_distance_from_its_image(distan
     ppo = PPO(2, 1, dataclasses.replace(tiny().ppo, mirror_width=0.3))
     normalizer = ppo.init(jax.random.PRNGKey(0)).normalizer
     seen = normalizer.mean + normalizer.std * jnp.array([[0.5, -0.5]])
-    image = seen + normalizer.std * distance
-    np.testing.assert_allclose(ppo._sidedness(normalizer, seen, image), [share], atol=1e-5)
+    same = mirror.Reflection(np.arange(2), np.ones(2), np.asarray(normalizer.std * distance))
+    ppo.mirror = mirror.Mirror(same, same)
+    image, counted = ppo._mirrored(normalizer, seen)
+    np.testing.assert_allclose(image - seen, [normalizer.std * distance], atol=1e-6)
+    np.testing.assert_allclose(counted, [share], atol=1e-5)

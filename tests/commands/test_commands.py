@@ -454,6 +454,17 @@ def test_an_evaluation_tells_as_training_does(robot, slow_and_left, monkeypatch)
     np.testing.assert_allclose(played.velocity[-1, 0], [min(1.0, 0.4 + 50 / rate), 0.0, 0.5], atol=1e-6)
 
 
+def test_starts_under_a_command_are_not_all_one_sample():
+    """A recording that moves as told for one sample only, and a gait that does for a hundred."""
+    command = np.array([0.5, 0.0, 0.2])
+    recording = command + np.linspace(0, 1, 1000)[:, None] * np.array([1.0, 0.0, -1.0])
+    assert steering.nearest_rows(recording, command).tolist() == list(range(steering.STARTS))
+    gait = np.concatenate([recording, np.tile(command, (100, 1))])
+    near = steering.nearest_rows(gait, command)
+    assert set(range(1000, 1100)) <= set(near) and np.abs(gait[near] - command).sum(-1).max() <= steering.NEAR
+    assert steering.nearest_rows(recording[:3], command).tolist() == [0, 1, 2]
+
+
 @pytest.mark.slow
 def test_a_run_without_commands_has_no_grid(robot, walk):
     trainer = Trainer(preset("smoke", **TINY), walk)
