@@ -66,6 +66,7 @@ def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
         "step_dt": str(1.0 / policy.rate),
         "physics_dt": str(physics.timestep),
         "integrator": sim2sim.integrator(trained),
+        "self_collisions": str(sim2sim.self_collisions(trained)),
         **{name: _list(";".join(map(str, np.ravel(row))) for row in rows) for name, rows in facts.items()},
         "total_mass": str(robot.total_mass),
         "robot": robot.name,

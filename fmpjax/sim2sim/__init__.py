@@ -9,7 +9,7 @@ from fmpjax.sim2sim.episodes import COURSE, Course, Episode, course, play, repor
 from fmpjax.sim2sim.exported import ExportedPolicy, load, read
 from fmpjax.sim2sim.observation import TERMS
 from fmpjax.sim2sim.simulation import Simulation
-from fmpjax.sim2sim.traits import FACTS, facts, integrator
+from fmpjax.sim2sim.traits import FACTS, facts, integrator, self_collisions
 
 __all__ = [
     "COURSE",
@@ -26,4 +26,5 @@ __all__ = [
     "play",
     "read",
     "report",
+    "self_collisions",
 ]

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from fmpjax.sim2sim.exported import ExportedPolicy
-from fmpjax.sim2sim.traits import FACTS, facts, integrator
+from fmpjax.sim2sim.traits import FACTS, facts, integrator, self_collisions
 
 
 def differences(
@@ -50,6 +50,9 @@ def differences(
     control = substeps * model.opt.timestep
     if abs(control - policy.step_dt) > 1e-9:
         said.append(f"control every {1e3 * control:g} ms, in training {1e3 * policy.step_dt:g} ms")
+    pairs, trained_pairs = self_collisions(model), policy.self_collisions
+    if trained_pairs is not None and pairs != trained_pairs:
+        said.append(f"{pairs} pairs of its bodies can hit each other, in training {trained_pairs}")
     if (own := integrator(model)) != policy.integrator:
         said.append(f"integrator {own}, in training {policy.integrator}")
     return said

@@ -38,6 +38,7 @@ class ExportedPolicy(NamedTuple):
     robot: str
     average: float = 0.5  # s, time constant of the running means of the velocity's errors
     error_scale: float = 0.3  # m/s and rad/s; a larger error counts in them by its logarithm
+    self_collisions: int | None = None  # pairs of bodies that could collide in training; None: the file doesn't say
     ramp: np.ndarray | None = None  # [3] how fast it is told of a new one (m/s², m/s², rad/s²); None: at once
     commands: np.ndarray | None = None  # [2, 3] lowest and highest velocity that it may be told (m/s, m/s, rad/s)
 
@@ -117,6 +118,7 @@ def read(
             robot=said["robot"],
             average=float(said.get("command_average", 0.5)),
             error_scale=float(said.get("command_error_scale", 0.3)),
+            self_collisions=int(said["self_collisions"]) if "self_collisions" in said else None,
             ramp=_rows(said["command_ramp"])[0] if said.get("command_ramp") else None,
             commands=_rows(said["command_ranges"]).T if said.get("command_ranges") else None,
         )

@@ -12,6 +12,20 @@ def integrator(model: mujoco.MjModel | mujoco.MjSpec) -> str:
     return mujoco.mjtIntegrator(option.integrator).name.removeprefix("mjINT_").lower()
 
 
+def self_collisions(model: mujoco.MjModel) -> int:
+    """Pairs of a model's moving bodies that can collide with each other, however far apart they are."""
+    geoms = [geom for geom in range(model.ngeom) if model.body_weldid[model.geom_bodyid[geom]]]
+    bodies = model.body_weldid[model.geom_bodyid[geoms]]
+    kinds, takes = model.geom_contype[geoms], model.geom_conaffinity[geoms]
+    collide = (kinds[:, None] & takes | kinds & takes[:, None]) != 0
+    pairs = {tuple(sorted(pair)) for pair in np.stack([bodies[i] for i in np.nonzero(collide)], -1).tolist()}
+    first = model.body_weldid[model.body_parentid]
+    excluded = {(int(code) >> 16, int(code) & 0xFFFF) for code in model.exclude_signature}
+    excluded = {tuple(sorted(model.body_weldid[list(pair)].tolist())) for pair in excluded}
+    # MuJoCo leaves out a body and its parent.
+    return len([(a, b) for a, b in pairs - excluded if a != b and first[b] != a and first[a] != b])
+
+
 # What `facts` says: its words, its unit, and the difference from which it is told.
 FACTS = {
     "joint_places": ("places", "m", 1e-4),

@@ -479,6 +479,29 @@ def test_what_differs_is_said_and_a_fall_ends_an_episode(exported, robot, tmp_pa
 
 
 @needs_onnx
+def test_bodies_that_hit_each_other_only_here_are_said(exported):
+    from fmpjax import sim2sim
+
+    here = resources.folder("robots") / "unitree_g1_29dof" / "robot.xml"
+    sim = sim2sim.Simulation(sim2sim.load(exported), here)
+    assert "180 pairs of its bodies can hit each other, in training 0" in sim.differences
+
+
+@pytest.mark.parametrize("name", robots.available())
+def test_pairs_of_bodies_are_those_that_mujoco_finds_at_any_distance(name):
+    from fmpjax import sim2sim
+
+    model = robots.load(name).physics_model()
+    model.geom_margin[:] = 100.0
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE  # which leaves out pairs by their boxes
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    bodies = model.body_weldid[model.geom_bodyid[data.contact.geom]]
+    found = {tuple(sorted(pair)) for pair in bodies.tolist() if 0 not in pair}
+    assert sim2sim.self_collisions(model) == len(found)
+
+
+@needs_onnx
 def test_a_model_keeps_the_gains_of_its_own_servos(exported, robot, tmp_path):
     from fmpjax import sim2sim
 
