@@ -16,6 +16,7 @@ from fmpjax.robots import Robot
 
 def metadata(policy: Policy, robot: Robot, origin: Origin) -> dict[str, str]:
     """What the file says of itself, text by key."""
+    # long: a table of keys
     terms, physics = features.observation_terms(robot, policy.observation), origin.config.physics
     steps = features.observation_history(policy.observation)
     # As `fmpjax.physics` steps it, whatever the file of the robot says.
