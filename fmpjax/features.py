@@ -19,7 +19,7 @@ from jaxtyping import Float
 from fmpjax import kinematics, rotations
 from fmpjax.config import Config, FeatureConfig
 from fmpjax.errors import UserError
-from fmpjax.frames import FORWARD, PLANAR, FrameLayout
+from fmpjax.frames import FORWARD, PLANAR, FrameLayout, headed
 from fmpjax.motion.library import parse
 from fmpjax.robots import Robot
 
@@ -249,14 +249,7 @@ class Observed(NamedTuple):
 def _turned(p: _Parts) -> _Parts:
     """The same in axes of which x points where the root faces."""
     names = ("rotation", "velocity", "angular_velocity", "key_points")
-    return p._replace(**{name: _along(p.rotation[..., :2], getattr(p, name)) for name in names})
-
-
-def _along(forward: jax.Array, vectors: jax.Array) -> jax.Array:
-    """Vectors ``[..., 3 n]`` in axes of which x points along ``forward [..., 2]`` and z stays."""
-    cosine, sine = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
-    x, y, z = (vectors[..., i::3] for i in range(3))
-    return jnp.stack([x * cosine + y * sine, y * cosine - x * sine, z], axis=-1).reshape(vectors.shape)
+    return p._replace(**{name: headed(p.rotation[..., :2], getattr(p, name)) for name in names})
 
 
 @partial(jax.jit, static_argnames=("robot", "form"), inline=True)
@@ -306,7 +299,7 @@ def turned_windows(windows: Float[jax.Array, "*batch H F"], layout: FrameLayout)
     forward = windows[..., -1:, FORWARD]
     parts = {name: windows[..., part] for name, part in layout._asdict().items()}
     for name in ("root", "rotation", "key_points", "velocity", "angular_velocity"):
-        parts[name] = _along(forward, parts[name])
+        parts[name] = headed(forward, parts[name])
     return FrameLayout.join(**parts)
 
 

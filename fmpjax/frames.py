@@ -39,16 +39,20 @@ class FrameLayout(NamedTuple):
 
     def heading_velocity(self, frames: Float[Any, "*batch F"]) -> Float[jax.Array, "*batch 3"]:
         """The root's velocity in the heading frame: m/s ahead, m/s and rad/s to the left."""
-        forward = frames[..., FORWARD]
-        x, y = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
-        vx, vy, _ = jnp.split(frames[..., self.velocity], 3, axis=-1)
-        turning = frames[..., self.angular_velocity][..., 2:]
-        return jnp.concatenate([vx * x + vy * y, vy * x - vx * y, turning], axis=-1)
+        velocity, turning = headed(frames[..., FORWARD], frames[..., self.velocity]), frames[..., self.angular_velocity]
+        return jnp.concatenate([velocity[..., :2], turning[..., 2:]], axis=-1)
 
     @classmethod
     def join(cls, **parts: Float[jax.Array, "*batch _"]) -> Float[jax.Array, "*batch F"]:
         """Frames ``[..., F]`` of their parts, each given by its field's name."""
         return jnp.concatenate([parts[name] for name in cls._fields], axis=-1)
+
+
+def headed(forward: Float[jax.Array, "*#batch 2"], vectors: Float[jax.Array, "*#batch n"]) -> Float[jax.Array, "... n"]:
+    """Vectors ``[..., n]``, three numbers each, in axes of which x points along ``forward [..., 2]`` and z stays."""
+    cosine, sine = jnp.split(forward / jnp.maximum(jnp.linalg.norm(forward, axis=-1, keepdims=True), 1e-6), 2, axis=-1)
+    x, y, z = (vectors[..., i::3] for i in range(3))
+    return jnp.stack([x * cosine + y * sine, y * cosine - x * sine, z], axis=-1).reshape(vectors.shape)
 
 
 def _slices(*widths: int) -> list[slice]:

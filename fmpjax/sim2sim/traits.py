@@ -19,11 +19,13 @@ def self_collisions(model: mujoco.MjModel) -> int:
     kinds, takes = model.geom_contype[geoms], model.geom_conaffinity[geoms]
     collide = (kinds[:, None] & takes | kinds & takes[:, None]) != 0
     pairs = {tuple(sorted(pair)) for pair in np.stack([bodies[i] for i in np.nonzero(collide)], -1).tolist()}
-    first = model.body_weldid[model.body_parentid]
-    excluded = {(int(code) >> 16, int(code) & 0xFFFF) for code in model.exclude_signature}
-    excluded = {tuple(sorted(model.body_weldid[list(pair)].tolist())) for pair in excluded}
-    # MuJoCo leaves out a body and its parent.
-    return len([(a, b) for a, b in pairs - excluded if a != b and first[b] != a and first[a] != b])
+    excluded = np.stack([model.exclude_signature >> 16, model.exclude_signature & 0xFFFF], -1)
+    pairs -= {tuple(sorted(pair)) for pair in model.body_weldid[excluded].tolist()}
+    # MuJoCo leaves out a body and its parent, and takes what the file names as a pair.
+    parent = model.body_weldid[model.body_parentid]
+    pairs = {(a, b) for a, b in pairs if a != b and parent[b] != a and parent[a] != b}
+    named = model.body_weldid[model.geom_bodyid[np.stack([model.pair_geom1, model.pair_geom2], -1)]]
+    return len(pairs | {tuple(sorted(pair)) for pair in named.tolist() if 0 not in pair})
 
 
 # What `facts` says: its words, its unit, and the difference from which it is told.

@@ -487,6 +487,27 @@ def test_bodies_that_hit_each_other_only_here_are_said(exported):
     assert "180 pairs of its bodies can hit each other, in training 0" in sim.differences
 
 
+@pytest.mark.parametrize(
+    ("contact", "count"),
+    [
+        ("", 1),  # the feet; a foot and its own leg are neighbors, and a leg alone collides with nothing
+        ('<exclude body1="left" body2="right"/>', 0),
+        ('<pair geom1="thigh" geom2="left"/>', 2),
+        ('<pair geom1="floor" geom2="left"/>', 1),
+    ],
+)
+def test_pairs_of_bodies_that_hit_each_other_are_counted(contact, count):
+    from fmpjax import sim2sim
+
+    foot = '<body name="{0}" pos="0 {1} -1"><joint/><geom name="{0}" size="0.1"/></body>'
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><contact>{contact}</contact><worldbody><geom name="floor" type="plane" size="1 1 1"/>
+        <body><freejoint/><geom name="thigh" size="0.1" contype="0" conaffinity="0"/>
+        {foot.format("left", 1)}{foot.format("right", -1)}</body></worldbody></mujoco>"""
+    )
+    assert sim2sim.self_collisions(model) == count
+
+
 @pytest.mark.parametrize("name", robots.available())
 def test_pairs_of_bodies_are_those_that_mujoco_finds_at_any_distance(name):
     from fmpjax import sim2sim
