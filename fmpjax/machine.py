@@ -68,6 +68,15 @@ def cache_folder(*names: str) -> Path | None:
     return folder
 
 
+def processor() -> str:
+    """The name of the processor, as far as the system knows it."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
 def _processor() -> str:
     """What tells kinds of processors apart."""
     told = [platform.machine(), platform.processor()]

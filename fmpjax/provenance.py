@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 
 from fmpjax import shell
-from fmpjax.machine import cores
+from fmpjax.machine import cores, processor
 
 _PACKAGES = "jax jaxlib mujoco mujoco-mjx brax flax optax ott-jax orbax-checkpoint numpy".split()
 
@@ -39,6 +39,7 @@ def provenance() -> dict[str, object]:
         "python": platform.python_version(),
         "packages": {name: importlib.metadata.version(name) for name in _PACKAGES},
         "device": machine(),
+        "processor": processor(),
         "cores": cores(),
     }
 

@@ -36,6 +36,7 @@ SMOKE = Specification(
     resets=("dataset",),
     seeds=(0, 1),
     settings={**SETTINGS, "evaluations": (0.5, 1.0)},
+    pictures=False,
 )
 
 
@@ -75,7 +76,7 @@ def main(
     """
     # An exception, so that who ends the benchmark ends its cells, which save.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    start = SMOKE if smoke else Specification(methods=priors.METHODS, seeds=SEEDS, settings=SETTINGS)
+    start = SMOKE if smoke else Specification(methods=priors.METHODS, seeds=SEEDS, settings=SETTINGS, pictures=False)
     named = {"preset": preset, "methods": methods, "resets": resets, "seeds": seeds, "transitions": transitions}
     changed: dict[str, Any] = {key: value for key, value in named.items() if value is not None}
     changed["settings"] = {**start.settings, **_settings(set)}

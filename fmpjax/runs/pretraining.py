@@ -19,6 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from filelock import FileLock, Timeout
 
 from fmpjax import jsons, machine, sharding
 from fmpjax.errors import UserError
@@ -65,6 +66,8 @@ def folder_of(trainer: Trainer) -> Path | None:
 def pretrain(trainer: Trainer, folder: Path, progress: Progress, *, again: bool = False) -> Any:
     """What the trainer's method learns before any policy: what a folder holds or, where it holds none, trained now.
 
+    One process at a time trains it; those that begin meanwhile wait, and read it.
+
     Args:
       trainer: of a method with a pretraining.
       folder: that `folder_of` gives, or another one.
@@ -74,6 +77,21 @@ def pretrain(trainer: Trainer, folder: Path, progress: Progress, *, again: bool 
     Raises:
       UserError: the loss was not finite, or the folder cannot be written.
     """
+    lock = FileLock(folder.with_name(f".{folder.name}.lock"))
+    try:
+        with contextlib.suppress(Timeout):
+            lock.acquire(timeout=0)
+        if not lock.is_locked:
+            progress.note(f"another process pretrains {trainer.config.method} on the demonstration: waiting for it")
+            lock.acquire()
+        return _pretrain(trainer, folder, progress, again)
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written: {error.strerror or error}") from None
+    finally:
+        lock.release()
+
+
+def _pretrain(trainer: Trainer, folder: Path, progress: Progress, again: bool) -> Any:
     method = trainer.config.method
     if folder.exists() and not again:
         with contextlib.suppress(OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
@@ -81,17 +99,13 @@ def pretrain(trainer: Trainer, folder: Path, progress: Progress, *, again: bool 
             progress.note(f"{method} is pretrained on the demonstration already, in {folder}")
             return kept
         progress.note(f"{folder} cannot be read: pretraining again")
+    partial = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder.parent))
     try:
-        partial = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder.parent))
-        try:
-            learned = _train(trainer, partial, progress)
-            shutil.rmtree(folder, ignore_errors=True)
-            with contextlib.suppress(FileExistsError):  # another process was faster
-                partial.rename(folder)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
-    except OSError as error:
-        raise UserError(f"{folder} cannot be written: {error.strerror or error}") from None
+        learned = _train(trainer, partial, progress)
+        shutil.rmtree(folder, ignore_errors=True)
+        partial.rename(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
     return learned
 
 

@@ -39,8 +39,10 @@ def test_plan_is_every_method_of_the_paper_reset_and_seed():
     assert {(c.config.method, c.config.env.reset, c.config.seed) for c in planned} == {
         (m, r, s) for m in priors.PAPER for r in ("dataset", "fixed") for s in (0, 7)
     }
+    # All of a seed come before the next one, so that half of a plan is a comparison, too.
+    assert [c.config.seed for c in planned] == [0] * 12 + [7] * 12
     # Nothing else differs between two cells.
-    a, b = (configuration.flatten(c.config) for c in planned[:2])
+    a, b = (configuration.flatten(c.config) for c in planned[::12])
     assert {k for k in a if a[k] != b[k]} == {"seed"}
 
 
@@ -52,9 +54,9 @@ def test_plan_from_a_file(tmp_path):
     )
     planned = cells.plan(spec)
     assert [c.name for c in planned] == [
-        "fmp-dataset-short/seed0", "fmp-dataset-short/seed1", "fmp-dataset-long/seed0", "fmp-dataset-long/seed1",
+        "fmp-dataset-short/seed0", "fmp-dataset-long/seed0", "fmp-dataset-short/seed1", "fmp-dataset-long/seed1",
     ]  # fmt: skip
-    assert [c.config.env.first_cap for c in planned] == [32, 32, 64, 64]
+    assert [c.config.env.first_cap for c in planned] == [32, 64, 32, 64]
     assert {c.config.ppo.discount for c in planned} == {0.9}
 
 
@@ -67,6 +69,7 @@ def test_plan_from_a_file(tmp_path):
         ("seeds = []", "expected a list of whole numbers"),
         ("methods = [1]", "expected a list of names"),
         ("transitions = 1.5", "transitions is 1.5, expected a whole number"),
+        ("pictures = 0", "pictures is 0, expected true or false"),
         ("variants = 3", "expected tables of"),
         ("preset = ", "plan.toml is not valid TOML"),
     ],

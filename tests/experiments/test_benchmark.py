@@ -32,7 +32,9 @@ needs_submitit = pytest.mark.skipif(submitit is None, reason="the extra benchmar
 
 def small(*methods, motions=("walk",), seeds=(0,)):
     settings = {**benchmark.SETTINGS, **SMALL}
-    specification = Specification(preset="smoke", methods=methods, resets=("dataset",), seeds=seeds, settings=settings)
+    specification = Specification(
+        preset="smoke", methods=methods, resets=("dataset",), seeds=seeds, settings=settings, pictures=False
+    )
     return benchmark.plan(specification, motions)
 
 
@@ -51,6 +53,7 @@ def test_all_methods_have_one_setting_for_all_motions():
         assert apart == {"motion", "seed", "env.reset"}
     assert planned[0].name == f"{priors.METHODS[0]}-dataset-walk/seed0" and planned[0].config.features.axes == "heading"
     assert len(planned[0].config.evaluations) == 10
+    assert "--no-pictures" not in planned[0].command and all("--no-pictures" in c.command for c in small("fmp"))
 
 
 def test_motions_of_ones_own_join_the_default_ones(tmp_path):

@@ -92,22 +92,28 @@ def test_time_to_walk_is_of_the_first_evaluation_that_walks():
     assert np.isnan(scores.time_to_walk(rows[:1])).all()
 
 
-def test_equal_transitions_take_the_last_evaluation_and_equal_wall_time_the_nearest():
-    """The fast method spends its budget in 30 s on average; the slow one has an evaluation each 20 s."""
+def test_equal_transitions_take_the_last_evaluation_and_equal_wall_time_the_last_in_time():
+    """The seeds of the fast method end by 31 s; one that is a little later, at 38 s, is later."""
     fast = [history([row(100, 15.0, "amp", seed=s), row(200, end, "amp", seed=s)]) for s, end in ((0, 29.0), (1, 31.0))]
-    slow = history([row(50, 21.0, falls=5.0), row(100, 38.0, quality=0.5), row(200, 80.0)])
+    slow = history([row(20, 9.0, falls=5.0), row(50, 21.0, quality=0.5), row(100, 38.0), row(200, 80.0)])
     found = {(r.method, r.seed, r.budget): r for r in scores.results([*fast, slow])}
     assert {(key[2], r.transitions) for key, r in found.items() if key[0] == "amp"} == {
         ("transitions", 200), ("seconds", 200),
     }  # fmt: skip
     assert found["fmp", 0, "transitions"].seconds == 80.0
     equal = found["fmp", 0, "seconds"]
-    assert (equal.transitions, equal.seconds, equal.scores["quality"]) == (100, 38.0, 0.5)
+    assert (equal.transitions, equal.seconds, equal.scores["quality"]) == (50, 21.0, 0.5)
     # Until then it had walked once; at equal transitions no other way.
-    assert (equal.walk_transitions, equal.walk_seconds) == (100.0, 38.0)
+    assert (equal.walk_transitions, equal.walk_seconds) == (50.0, 21.0)
+    assert equal.scores["time_to_walk"] == pytest.approx(50e-6)
     early = history([row(50, 29.0, falls=5.0), row(200, 60.0)])
     (never,) = (r for r in scores.results([*fast, early]) if (r.method, r.budget) == ("fmp", "seconds"))
-    assert math.isnan(never.walk_transitions)
+    # One that has not walked may do so right after.
+    assert math.isnan(never.walk_transitions) and never.scores["time_to_walk"] == pytest.approx(50e-6)
+    # The first evaluation counts where even that is later.
+    late = history([row(50, 40.0), row(200, 60.0)])
+    (only,) = (r for r in scores.results([*fast, late]) if (r.method, r.budget) == ("fmp", "seconds"))
+    assert only.seconds == 40.0
     # Another motion has a time of its own.
     other = history([row(100, 50.0, motion="turn"), row(200, 100.0, motion="turn")])
     (found,) = (r for r in scores.results([*fast, other]) if (r.motion, r.budget) == ("turn", "seconds"))
@@ -153,7 +159,11 @@ def test_intervals_are_stratified_by_motion():
 def test_profile_is_the_share_at_or_above_each_threshold():
     found = statistics.profile([np.array([0.1, 0.5]), np.array([0.5, 0.9])], np.array([0.0, 0.5, 0.6, 1.0]))
     assert [each.value for each in found] == [1.0, 0.75, 0.25, 0.0]
-    assert found[0].low == found[0].high == 1.0 and found[1].low < 0.75
+    # Where all or none are, no resample differs: Wilson's interval of 4 of 4, from 1 / (1 + 1.96² / 4) on.
+    least = 4 / (4 + 1.959964**2)
+    assert found[0] == pytest.approx((1.0, least, 1.0)) and found[3] == pytest.approx((0.0, 0.0, 1 - least))
+    assert found[1].low < 0.75 and statistics.share([np.ones(2), np.ones(2)]) == found[0]
+    assert statistics.share([np.array([0.0, 1.0]), np.ones(2)]) == statistics.mean([np.array([0.0, 1.0]), np.ones(2)])
 
 
 def test_improvement_is_paired_by_seed():
@@ -168,6 +178,17 @@ def test_improvement_is_paired_by_seed():
     # Two wins of two are no proof, and motions weigh the same however many seeds they have.
     assert not statistics.differs(statistics.improvement([np.ones(2)], [np.zeros(2)]))
     assert statistics.improvement([np.ones(2), np.zeros(6)], [np.zeros(2), np.ones(6)]).value == 0.5
+
+
+def test_sign_test_counts_pairs_of_all_motions():
+    """Of 13 wins in 20 pairs p is 0.26, though three of four motions are unanimous; five of five are no proof."""
+    theirs = [np.zeros(5)] * 4
+    ours = [np.ones(5), np.ones(5), -np.ones(5), np.array([1.0, 1.0, 1.0, -1.0, -1.0])]
+    assert statistics.differs(statistics.improvement(ours, theirs))  # the bootstrap sees one motion vary
+    assert statistics.sign_test(ours, theirs) == pytest.approx(0.2632, abs=1e-4)
+    assert statistics.sign_test(ours[:1], theirs[:1]) == 2 * 0.5**5
+    assert statistics.sign_test([np.array([1.0, 0.0, 0.0])], [np.zeros(3)]) == 1.0  # ties are left out
+    assert statistics.sign_test(theirs, theirs) == 1.0
 
 
 def test_one_seed_has_no_interval_and_nothing_no_value():
@@ -198,7 +219,11 @@ def test_methods_are_compared_on_the_seeds_that_all_have():
     by = {(s["method"], s["score"]): s for s in found["scores"]}
     assert by["fmp", "quality"]["cells"] == by["amp", "quality"]["cells"] == 5
     assert by["fmp", "quality"]["value"] == pytest.approx(0.4) and by["amp", "foot_slip"]["value"] == 0.3
-    assert by["amp", "foot_slip"]["low"] is None and by["fmp", "walks"]["value"] == 100.0
+    assert by["amp", "foot_slip"]["low"] is None
+    walks = by["fmp", "walks"]  # all five do: Wilson's interval
+    assert [walks[key] for key in Estimate._fields] == pytest.approx([100.0, 100 * 5 / (5 + 1.959964**2), 100.0])
+    of_walk = [{k: v for k, v in line.items() if k != "motion"} for line in found["by_motion"]]
+    assert of_walk == found["scores"]  # there is one motion
     (ours,) = (i for i in found["improvements"] if i["method"] == "amp")
     assert ours["value"] == 0.8 and ours["seeds"] == 5 and ours["over"] == "fmp"
     table = comparison.table(found)
@@ -216,17 +241,20 @@ def test_methods_are_compared_on_the_seeds_that_all_have():
         (0.9, 5, "AMP is better than FMP (100 (72 to 100) %)"),
         (0.1, 5, "AMP is worse than FMP (0 (0 to 28) %)"),
         (0.5, 5, "no difference between AMP and FMP is shown"),
+        # Eight of ten pairs: the bootstrap's interval leaves out a half, but the sign test's p is 0.11.
+        ((0.9, 0.9, 0.9, 0.1, 0.1), 5, "no difference between AMP and FMP is shown (80 (60 to 100) %)"),
         (0.9, 4, "nothing is claimed of AMP and FMP, with fewer than 5 seeds of a motion"),
         (0.9, 1, "nothing is claimed of AMP and FMP, with fewer than 5 seeds of a motion"),
     ],
 )
 def test_claims_have_intervals_and_seeds(ours, seeds, said):
     """Ten pairs on two motions; 10 of 10 are Wilson's 72 to 100 %."""
+    turn = ours if isinstance(ours, tuple) else (ours,) * 5
     results = [
         result(method, seed, quality, motion)
-        for motion in ("walk", "turn")
+        for motion, better in (("walk", turn[:1] * 5), ("turn", turn))
         for seed in range(seeds)
-        for method, quality in (("fmp", 0.5), ("amp", ours))
+        for method, quality in (("fmp", 0.5), ("amp", better[seed]))
     ]
     (sentence,) = comparison.sentences(record(results))
     assert sentence.startswith("dataset reset, equal transitions: ") and said in sentence

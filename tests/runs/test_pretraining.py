@@ -3,6 +3,8 @@
 import csv
 import dataclasses
 import json
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -46,7 +48,7 @@ def test_what_is_learned_is_kept_with_its_course(trainer, cache, monkeypatch, ca
     folder = pretraining.folder_of(trainer)
     monkeypatch.setattr(pretraining, "ROWS", 10)
     learned = pretraining.pretrain(trainer, folder, Progress())
-    assert folder.parent == cache and [path.name for path in cache.iterdir()] == [folder.name]
+    assert folder.parent == cache and [path.name for path in cache.glob("[!.]*")] == [folder.name]
     rows = list(csv.DictReader((folder / "metrics.csv").open()))
     assert [int(row["iteration"]) for row in rows] == list(range(3, 31, 3))
     losses = [float(row["pretraining/loss"]) for row in rows]
@@ -64,6 +66,33 @@ def test_what_is_learned_is_kept_with_its_course(trainer, cache, monkeypatch, ca
     assert f"smp is pretrained on the demonstration already, in {folder}" in capsys.readouterr().out
     with pytest.raises(TypeError):
         pretraining.pretrain(trainer, folder, Progress(), again=True)
+
+
+def test_who_begins_meanwhile_waits_and_reads(trainer, cache, monkeypatch, capsys):
+    """Two cells that start together train once."""
+    folder, train, calls = pretraining.folder_of(trainer), pretraining._train, []
+    waits = threading.Event()
+
+    def slow(*arguments):
+        calls.append(arguments)
+        waits.wait(60.0)
+        return train(*arguments)
+
+    class Told(Progress):
+        def note(self, line):
+            super().note(line)
+            if "waiting for it" in line:
+                waits.set()
+
+    monkeypatch.setattr(pretraining, "_train", slow)
+    with ThreadPoolExecutor(2) as pool:
+        both = [pool.submit(pretraining.pretrain, trainer, folder, Told()) for _ in range(2)]
+        one, other = (leaves(each.result()) for each in both)
+    assert len(calls) == 1 and waits.is_set()
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a, b)
+    said = capsys.readouterr().out
+    assert "another process pretrains smp" in said and "pretrained on the demonstration already" in said
 
 
 def test_a_file_that_is_broken_is_made_again(trainer, capsys):
@@ -128,7 +157,7 @@ def test_numbers_that_are_not_finite_are_not_kept(trainer, cache, monkeypatch):
     bad = changed(trainer, prior=trainer.prior._replace(pretraining=broken))
     with pytest.raises(UserError, match=r"the pretraining of smp gave numbers that are not finite: expected a smaller"):
         pretraining.pretrain(bad, pretraining.folder_of(bad), Progress())
-    assert not list(cache.iterdir())
+    assert not list(cache.glob("[!.]*"))
 
 
 def test_a_session_pretrains_before_it_compiles(tmp_path, monkeypatch):
@@ -161,7 +190,7 @@ def test_the_command_pretrains_for_the_runs_that_follow(trainer, cache, capsys):
     settings = {key: value for key, value in SMP.items() if key != "method"}
     words = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
     cli.main(["pretrain", "smp", "--preset", "smoke", *words])
-    (folder,) = cache.iterdir()
+    (folder,) = cache.glob("[!.]*")
     assert folder == pretraining.folder_of(trainer)
     assert f"in the cache: {folder / 'curves.png'}" in capsys.readouterr().out
 

@@ -39,6 +39,7 @@ class Specification:
     seeds: tuple[int, ...] = (0,)
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # section.field: value, of every cell
     variants: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)  # by name, of its cells
+    pictures: bool = True  # whether a cell ends with frames and a film
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +50,7 @@ class Cell:
     variant: str  # "" where the specification has none
     config: Config
     changes: Mapping[str, Any]  # by which the configuration departs from its preset
+    pictures: bool = True  # whether it ends with frames and a film
 
     @property
     def group(self) -> str:
@@ -59,7 +61,7 @@ class Cell:
     def command(self) -> list[str]:
         """Arguments of ``fmpjax train``, without the run's folder."""
         settings = [f"--set={key}={_text(value)}" for key, value in self.changes.items()]
-        return ["train", "--preset", self.config.preset, *settings]
+        return ["train", "--preset", self.config.preset, *settings, *([] if self.pictures else ["--no-pictures"])]
 
 
 def _text(value: Any) -> str:
@@ -98,6 +100,8 @@ def _check(path: Path, key: str, value: Any) -> None:
     elif key == "variants":
         good = isinstance(value, dict) and all(isinstance(v, dict) for v in value.values())
         expected = "tables of section.field = value"
+    elif key == "pictures":
+        good, expected = type(value) is bool, "true or false"
     elif key == "transitions":
         good, expected = type(value) is int and value >= 0, "a whole number"
     else:
@@ -107,7 +111,7 @@ def _check(path: Path, key: str, value: Any) -> None:
 
 
 def plan(specification: Specification) -> list[Cell]:
-    """The cells of a specification, seeds innermost.
+    """The cells of a specification, seeds outermost: where it is ended early, all methods have the first seeds.
 
     Raises:
       UserError: a name, setting or value that no configuration can have, or a cell twice, or none at all.
@@ -117,13 +121,14 @@ def plan(specification: Specification) -> list[Cell]:
         priors.check(method)
     cells = []
     variants = s.variants or {"": {}}
-    for reset, method, variant, seed in itertools.product(s.resets, s.methods, variants, s.seeds):
+    for seed, reset, method, variant in itertools.product(s.seeds, s.resets, s.methods, variants):
         changes: dict[str, Any] = {"motion": s.motion, "method": method, "env.reset": reset, "seed": seed}
         changes |= {"frames": s.frames} if s.frames else {}
         changes |= {"transitions": s.transitions} if s.transitions else {}
         changes |= {**s.settings, **variants[variant]}
         group = "-".join(part for part in (method, reset, variant) if part)
-        cells.append(Cell(f"{group}/seed{seed}", variant, configuration.preset(s.preset, **changes), changes))
+        made = configuration.preset(s.preset, **changes)
+        cells.append(Cell(f"{group}/seed{seed}", variant, made, changes, s.pictures))
     if not cells:
         raise UserError("the plan has no cells: expected at least one method, reset and seed")
     for name, count in Counter(cell.name for cell in cells).items():

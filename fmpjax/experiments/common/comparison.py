@@ -20,6 +20,9 @@ from fmpjax.experiments.common.table import title
 
 BY = "quality"  # the score by which one method is better than another
 POINTS = 41  # of a profile
+# Of one cell they may be 0 or 100 and nothing between, as from the fixed pose, which has one start without noise.
+SHARES = ("walks", "falls_at_0")
+MOST_P = 0.05  # of the sign test, up to which one method is said to be better than another
 LEAST_SEEDS = 5  # of every motion, from which on one method is said to be better than another
 _EQUAL = {"transitions": "equal transitions", "seconds": "equal wall time"}
 
@@ -55,28 +58,41 @@ def samples(cells: Mapping[tuple[str, int], Result], score: str) -> list[np.ndar
 def compare(results: Sequence[Result]) -> dict[str, Any]:
     """All statistics, for JSON.
 
-    ``scores`` has the interquartile mean of each score of each method (of ``walks`` the mean, which a share needs),
-    ``improvements`` how often each method has the higher quality than each other one, and ``profiles`` the share of
-    cells with at least a quality.
+    ``scores`` has the interquartile mean of each score of each method (of `SHARES` the mean), ``by_motion`` the same
+    for each motion, ``improvements`` how often each method has the higher quality than each other one, and ``profiles``
+    the share of cells with at least a quality.
     """
-    scores, improvements, profiles = [], [], []
+    scores, by_motion, improvements, profiles = [], [], [], []
     thresholds = np.linspace(0.0, 1.0, POINTS)
     for (reset, budget), methods in groups(results).items():
         where = {"reset": reset, "budget": budget}
         for method, cells in methods.items():
             of = where | {"method": method}
-            for score in SCORES:
-                values = samples(cells, score.name)
-                found = (statistics.mean if score.name == "walks" else statistics.interquartile_mean)(values)
-                count = sum(map(len, values))
-                scores.append(of | {"score": score.name} | found._asdict() | {"cells": count})
+            scores += [of | line for line in _scores(cells)]
+            for motion in sorted({motion for motion, _ in cells}):
+                own = {key: result for key, result in cells.items() if key[0] == motion}
+                by_motion += [of | {"motion": motion} | line for line in _scores(own)]
             ours = samples(cells, BY)
             shares = statistics.profile(ours, thresholds)
             profiles.append(of | {"thresholds": thresholds.tolist()} | _columns(shares))
             for other in [name for name in methods if name != method]:
-                found = statistics.improvement(ours, samples(methods[other], BY))
-                improvements.append(of | {"over": other} | found._asdict() | {"seeds": min(map(len, ours))})
-    return {"scores": scores, "improvements": improvements, "profiles": profiles}
+                theirs = samples(methods[other], BY)
+                found = statistics.improvement(ours, theirs)._asdict() | {"p": statistics.sign_test(ours, theirs)}
+                improvements.append(of | {"over": other} | found | {"seeds": min(map(len, ours))})
+    return {"scores": scores, "by_motion": by_motion, "improvements": improvements, "profiles": profiles}
+
+
+def _scores(cells: Mapping[tuple[str, int], Result]) -> list[dict[str, Any]]:
+    """The estimate of each score over the cells of a method."""
+    lines = []
+    for score in SCORES:
+        values = samples(cells, score.name)
+        if score.name == "walks":
+            found = Estimate(*(100.0 * end for end in statistics.share([part / 100.0 for part in values])))
+        else:
+            found = (statistics.mean if score.name in SHARES else statistics.interquartile_mean)(values)
+        lines.append({"score": score.name} | found._asdict() | {"cells": sum(map(len, values))})
+    return lines
 
 
 def _columns(estimates: Sequence[Estimate]) -> dict[str, list[float]]:
@@ -116,7 +132,7 @@ def table(record: Mapping[str, Any]) -> Table:
 
 
 def sentences(record: Mapping[str, Any]) -> list[str]:
-    """Who is better than the first method; where the interval holds a half, that no difference is shown."""
+    """Who is better than the first method, where both the interval and the sign test say so."""
     reference = record["plan"]["methods"][0]
     found = []
     for line in record["improvements"]:
@@ -126,7 +142,7 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
         ours, theirs = title(line["method"]), title(reference)
         if math.isnan(estimate.low) or line["seeds"] < LEAST_SEEDS:
             said = f"nothing is claimed of {ours} and {theirs}, with fewer than {LEAST_SEEDS} seeds of a motion"
-        elif statistics.differs(estimate):
+        elif statistics.differs(estimate) and line["p"] <= MOST_P:
             said = f"{ours} is {'better' if estimate.low > 0.5 else 'worse'} than {theirs}"
         else:
             said = f"no difference between {ours} and {theirs} is shown"

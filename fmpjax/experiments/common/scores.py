@@ -33,6 +33,7 @@ _SIZED = {f"falls_at_{size:g}": size for size in Config().evaluation_noise}  # r
 SCORES = (
     Score("quality", "quality", 3, 1),
     Score("walks", "walks, %", 0, 1),
+    Score("time_to_walk", "walks after, M", 2, -1),
     Score("falls", "falls, %", 1, -1),
     *(Score(name, f"at {size:g} rad, %", 1, -1) for name, size in _SIZED.items()),
     Score("pace_error", "pace error", 3, -1),
@@ -80,8 +81,13 @@ def read(cell: Cell, folder: Path) -> History:
     run = folder / cell.name
     made = json.loads((run / "provenance.json").read_text())
     ranges = json.loads((run / "evaluation.json").read_text())["expert_ranges"]
-    machines = frozenset(f"{each['device']}" for each in (made, *made.get("resumed", [])))
+    machines = frozenset(map(_machine, (made, *made.get("resumed", []))))
     return History(cell, table.evaluations(cell, folder), float(np.mean(ranges)), machines)
+
+
+def _machine(made: Mapping[str, Any]) -> str:
+    """The kind of machine that a provenance names; those of earlier versions do not have the processor."""
+    return ", ".join(str(made[key]) for key in ("device", "processor") if key in made)
 
 
 def walks(row: Row) -> bool:
@@ -94,7 +100,7 @@ def time_to_walk(rows: Sequence[Row]) -> tuple[float, float]:
     return next(((float(row.transitions), row.seconds) for row in rows if walks(row)), (math.nan, math.nan))
 
 
-def scores(row: Row, still: float) -> dict[str, float]:
+def scores(row: Row, still: float, walked: float = math.nan) -> dict[str, float]:
     """The scores of one evaluation, by name.
 
     A pace, an excursion or an amplitude that no episode lasts long enough to have is that of a robot that holds still,
@@ -103,11 +109,13 @@ def scores(row: Row, still: float) -> dict[str, float]:
     Args:
       row: of a cell.
       still: amplitude error of a robot that holds still, degrees.
+      walked: transitions until the cell first walked; of one that did not, those until now count.
     """
     excursion, amplitude = row.figure("excursion"), row.figure("amplitude_mae")
     return {
         "quality": row.figure("quality"),
         "walks": 100.0 * walks(row),
+        "time_to_walk": 1e-6 * (row.transitions if math.isnan(walked) else walked),
         "falls": row.figure("falls"),
         **{name: row.figure(name) for name in _SIZED},
         "pace_error": pace_error(row.figures),
@@ -129,25 +137,24 @@ def machines(histories: Sequence[History]) -> list[str]:
 def results(histories: Sequence[History]) -> list[Result]:
     """The scores of every cell at equal transitions and, where one kind of machine trained all, at equal wall time.
 
-    At equal transitions the last evaluation counts. At equal wall time it is, for each motion and reset, the evaluation
-    nearest to the mean time in which the fastest method spends its budget.
+    At equal transitions the last evaluation counts. At equal wall time it is, for each motion and reset, the last one
+    that is no later than the end of the fastest method, all of its seeds included.
     """
     found = [_result(history, history.rows[-1], "transitions") for history in histories]
     if len(machines(histories)) != 1:
         return found
     limits = _limits(histories)
     for history in histories:
-        limit = limits[_where(history)]
-        nearest = min(history.rows, key=lambda row: abs(row.seconds - limit))
-        found.append(_result(history, nearest, "seconds"))
+        within = [row for row in history.rows if row.seconds <= limits[_where(history)]]
+        found.append(_result(history, within[-1] if within else history.rows[0], "seconds"))
     return found
 
 
 def _result(history: History, row: Row, budget: str) -> Result:
-    until = [each for each in history.rows if each.transitions <= row.transitions]
+    walked = time_to_walk([each for each in history.rows if each.transitions <= row.transitions])
     return Result(
         row.method, row.reset, row.variant, row.seed, budget, row.transitions, row.seconds,
-        scores(row, history.still), *time_to_walk(until),
+        scores(row, history.still, walked[0]), *walked,
     )  # fmt: skip
 
 
@@ -161,4 +168,4 @@ def _limits(histories: Sequence[History]) -> Mapping[tuple[str, str], float]:
     for history in histories:
         methods = spent.setdefault(_where(history), {})
         methods.setdefault(history.cell.config.method, []).append(history.rows[-1].seconds)
-    return {where: min(float(np.mean(times)) for times in methods.values()) for where, methods in spent.items()}
+    return {where: min(map(max, methods.values())) for where, methods in spent.items()}

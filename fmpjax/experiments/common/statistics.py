@@ -33,15 +33,21 @@ def interquartile_mean(samples: Samples) -> Estimate:
 
 
 def mean(samples: Samples) -> Estimate:
-    """Mean of all values of all motions: of shares, which an interquartile mean would make 0 or 1."""
+    """Mean of all values of all motions."""
     return _single(samples, lambda *parts, axis: np.concatenate(parts, axis).mean(axis))
 
 
+def share(samples: Samples) -> Estimate:
+    """Mean of values from 0 to 1, of which an interquartile mean would make 0 or 1; Wilson's interval if all agree."""
+    return _held(mean(samples), sum(map(len, samples)))
+
+
 def profile(samples: Samples, thresholds: np.ndarray) -> list[Estimate]:
-    """Share of the values that are at least each of the thresholds ``[K]``."""
+    """Share of the values that are at least each of the thresholds ``[K]``; Wilson's interval if all or none are."""
     above = [np.asarray(part) >= thresholds[:, None] for part in samples]  # [K, seeds] of each motion
     shares = _estimate(above, lambda *parts, axis: np.concatenate(parts, axis).mean(axis))
-    return [Estimate(*map(float, each)) for each in zip(*shares, strict=True)]
+    count = sum(map(len, samples))
+    return [_held(Estimate(*map(float, each)), count) for each in zip(*shares, strict=True)]
 
 
 def improvement(ours: Samples, theirs: Samples) -> Estimate:
@@ -52,15 +58,27 @@ def improvement(ours: Samples, theirs: Samples) -> Estimate:
     pairs = zip(map(np.asarray, ours), map(np.asarray, theirs), strict=True)
     wins = [np.where(a == b, 0.5, a > b) for a, b in pairs]
     found = _single(wins, lambda *parts, axis: np.mean([part.mean(axis) for part in parts], axis=0))
-    if found.low != found.high:
-        return found
-    count = sum(map(len, wins))
-    return Estimate(found.value, *wilson(found.value * count, count))
+    return _held(found, sum(map(len, wins)))
+
+
+def sign_test(ours: Samples, theirs: Samples) -> float:
+    """How likely as uneven wins are if neither is better: p of the exact two-sided sign test; ties are left out.
+
+    Within a motion whose seeds all agree, the bootstrap sees no variance. This test counts pairs and does not need it.
+    """
+    off = np.concatenate([np.subtract(a, b) for a, b in zip(ours, theirs, strict=True)])
+    wins, losses = int((off > 0).sum()), int((off < 0).sum())
+    return float(stats.binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
 
 
 def differs(estimate: Estimate, level: float = 0.5) -> bool:
     """Whether the interval leaves out a level; never without an interval."""
     return estimate.low > level or estimate.high < level
+
+
+def _held(found: Estimate, count: int) -> Estimate:
+    """An estimate of a share; Wilson's interval of ``count`` trials where no resample differs from another."""
+    return Estimate(found.value, *wilson(found.value * count, count)) if found.low == found.high else found
 
 
 def _single(samples: Samples, statistic: Callable) -> Estimate:
