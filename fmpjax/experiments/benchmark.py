@@ -15,7 +15,7 @@ import tyro
 
 from fmpjax import priors
 from fmpjax.errors import UserError
-from fmpjax.experiments.common import cells, comparison, results, scores, table
+from fmpjax.experiments.common import cells, comparison, courses, results, scores, table
 from fmpjax.experiments.common.cells import Cell, Specification
 from fmpjax.motion import library
 from fmpjax.shell import default
@@ -133,8 +133,9 @@ def plan(specification: Specification, motions: Sequence[str]) -> list[Cell]:
 
 
 def write(planned: Sequence[Cell], folder: Path) -> list[Path]:
-    """Scores, statistics and pictures of the finished cells in ``folder``; the paths written."""
-    histories = [scores.read(cell, folder) for cell in planned if cells.finished(cell, folder)]
+    """Scores, statistics, courses and pictures of the finished cells in ``folder``; the paths written."""
+    finished = [cell for cell in planned if cells.finished(cell, folder)]
+    histories = [scores.read(cell, folder) for cell in finished]
     found = scores.results(histories)
     record = {
         "plan": {
@@ -152,7 +153,14 @@ def write(planned: Sequence[Cell], folder: Path) -> list[Path]:
     paths = results.save(folder, NAME, record, [each.line() for each in found], {folder, *motions})
     text = [results.markdown(comparison.table(record)), *(f"- {line}" for line in comparison.sentences(record))]
     (folder / f"{NAME}.md").write_text("\n".join([text[0], "", *text[1:]]) + "\n")
-    return [*paths, folder / f"{NAME}.md", *comparison.draw(record, found, [folder / f"{NAME}.png"])]
+    rows = [row for cell in finished for row in courses.course(cell, folder)]
+    return [
+        *paths,
+        folder / f"{NAME}.md",
+        *comparison.draw(record, found, [folder / f"{NAME}.png"]),
+        results.write_csv(folder / f"{NAME}_courses.csv", rows),
+        courses.draw(rows, folder / f"{NAME}_courses.png"),
+    ]
 
 
 def _each(planned: Sequence[Cell], key: str) -> list[Any]:

@@ -34,6 +34,8 @@ class Section(NamedTuple):
     provenance: Mapping[str, Any]
     command: str  # that makes it
     lines: Sequence[Mapping[str, str]] = ()  # of a table that the page's reader can sort and filter
+    sentences: Sequence[str] = ()  # below the table
+    courses: Path | None = None  # a second picture
 
 
 _RUNS = " --run STANDING_RUN --walking WALKING_RUN"
@@ -79,7 +81,12 @@ def _benchmark(folder: Path) -> Section | None:
     )  # fmt: skip
     if found.source is None:
         return None
-    return found._replace(lines=explorer.read(found.source.with_suffix(".csv")))
+    drawn = found.source.with_name(f"{benchmark.NAME}_courses.png")
+    return found._replace(
+        lines=explorer.read(found.source.with_suffix(".csv")),
+        sentences=comparison.sentences(json.loads(found.source.read_text())),
+        courses=drawn if drawn.exists() else None,
+    )
 
 
 def _section(
@@ -168,8 +175,10 @@ def page(sections: Sequence[Section], videos: Sequence[Path], root: Path) -> str
             parts.append(f"<p>Not measured here; <code>{html.escape(section.command)}</code> does so.</p>")
             continue
         parts += [_html_table(section.table), '<ul class="verdicts">', *map(_html_verdict, section.verdicts), "</ul>"]
-        if section.picture:
-            parts.append(f'<img alt="{html.escape(section.title)}" src="{_data(section.picture, "image/png")}">')
+        if section.sentences:
+            parts.append(f"<ul>{''.join(f'<li>{html.escape(said)}</li>' for said in section.sentences)}</ul>")
+        for picture in filter(None, (section.picture, section.courses)):
+            parts.append(f'<img alt="{html.escape(section.title)}" src="{_data(picture, "image/png")}">')
         if section.lines:
             parts.append(explorer.page(section.lines))
         parts.append(f'<p class="source">{_source(section, root, html.escape, "<code>{}</code>".format)}</p>')
@@ -208,8 +217,9 @@ def text(sections: Sequence[Section], videos: Sequence[Path], root: Path, out: P
                 f"- **{'Holds' if v.holds else 'Does not hold'}.** {v.claim}: {v.found}." for v in section.verdicts
             )
         )
-        if section.picture:
-            parts.append(f"![{section.title}]({link(section.picture)})")
+        if section.sentences:
+            parts.append("\n".join(f"- {said}" for said in section.sentences))
+        parts += [f"![{section.title}]({link(p)})" for p in (section.picture, section.courses) if p]
         parts.append(_source(section, root, str, "`{}`".format))
     parts += [
         "## Videos",

@@ -353,7 +353,13 @@ def test_the_report_holds_the_benchmark(tmp_path):
     page = (tmp_path / "report.html").read_text()
     assert page.count("<script>") == 1 and "http" not in page and page.count('data-column="') == 5
     assert page.count('<tr><td data-value="') == 8 and "dataset, equal wall time: AMP" in page
-    assert "dataset, equal transitions: FMP" in (tmp_path / "report.md").read_text()
+    text = (tmp_path / "report.md").read_text()
+    assert "dataset, equal transitions: FMP" in text
+    said = "dataset reset, equal wall time: nothing is claimed of AMP and FMP"
+    assert f"- {said}" in text and f"<li>{said}" in page and page.count("<img") == 0
+    (tmp_path / "benchmark_courses.png").write_bytes(b"picture")
+    report.write(tmp_path, tmp_path / "report.html")
+    assert (tmp_path / "report.html").read_text().count("<img") == 1
 
 
 def test_estimates_of_the_table_say_where_there_is_no_interval():
