@@ -83,8 +83,10 @@ def _play(trainer: Trainer, state: PPOState, rows: jax.Array, steps: int):
         now, alive, fell = carry
         taken = frozen.step(trainer, env, policy, now, alive, drawn)
         reached = taken.now
-        record = reached.physics.qpos, _points(trainer, reached.observed.frame), reached.command, alive
-        return (reached, taken.alive, fell | taken.fell), record
+        again = reached.command < now.command  # a clip that loops has ended, and is compared no further
+        row = jnp.where(again, env.clip_rows - 1, reached.command)
+        record = reached.physics.qpos, _points(trainer, reached.observed.frame), row, alive
+        return (reached, taken.alive & ~again, fell | taken.fell), record
 
     drawn = env.disturbance_draws(jax.random.PRNGKey(0), steps, len(rows))
     alive = jnp.ones(len(rows), bool)

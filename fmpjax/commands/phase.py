@@ -7,6 +7,7 @@ from fmpjax.commands.base import Command, Told
 from fmpjax.errors import UserError
 from fmpjax.frames import FrameLayout
 from fmpjax.motion import MotionLibrary
+from fmpjax.motion.edit import loops
 from fmpjax.robots import Robot
 
 HARMONICS = (1, 2)  # of the clip's duration, whose sines and cosines the networks see beside the share that is over
@@ -18,8 +19,9 @@ JOINTS, JOINT_VELOCITIES, HEIGHT, TILT = (0.5, 30.0), (0.2, 0.5), (0.15, 40.0), 
 def make(robot: Robot, library: MotionLibrary, frames: jax.Array, stride: int) -> Command:
     """The row of the demonstration that the robot should be at.
 
-    An episode begins at its reset's row and ends with the clip, as a time-out. The default pose begins the clip. The
-    networks see the time, and the joint angles that the robot should have at the next step, less the clip's mean.
+    An episode begins at its reset's row. A clip that loops begins again at its end; with any other one the episode ends
+    there, as a time-out. The default pose begins the clip. The networks see the time, and the joint angles that the
+    robot should have at the next step, less the clip's mean.
 
     Args:
       robot: whose frames are read.
@@ -33,17 +35,17 @@ def make(robot: Robot, library: MotionLibrary, frames: jax.Array, stride: int) -
     if len(library.clips) > 1:
         raise UserError(f"command.kind is 'phase' and the run has {len(library.clips)} motions: expected one")
     last, layout = len(library.qpos) - 1, FrameLayout.of(robot)
-    table = jnp.asarray(frames)
+    table, again = jnp.asarray(frames), loops(library.clips[0])
     pose = jnp.asarray(library.qpos[:, 7:] - library.qpos[:, 7:].mean(0), jnp.float32)
 
     def begin(rows, drawn):
-        return jnp.where(rows > last, 0, rows)
+        return jnp.where(rows >= (last if again else last + 1), 0, rows)  # of a loop the last row is the first one
 
     def following(row):
-        return jnp.minimum(row + stride, last)
+        return (row + stride) % last if again else jnp.minimum(row + stride, last)
 
     def advance(row, drawn, frame):
-        return Told(following(row), row + stride >= last, reward(row, frame))
+        return Told(following(row), (row + stride >= last) & (not again), reward(row, frame))
 
     def observe(row):
         share = row / last

@@ -10,7 +10,7 @@ from scipy.signal import savgol_filter
 
 from fmpjax import rotations, tables
 from fmpjax.motion.clip import MotionClip
-from fmpjax.motion.edit import loop_target
+from fmpjax.motion.edit import loop_target, loops
 from fmpjax.motion.soles import slides, sole_points
 from fmpjax.robots import Robot
 
@@ -22,7 +22,6 @@ MOST_TORQUES = 20_000  # samples of a clip whose torques are measured, for time
 MOST_PACE = 60.0  # s in which strides are looked for
 WAY = 0.5  # m; a root that ends nearer to its start has no way
 TURNED, HEADED = np.radians(45), np.radians(20)  # from where a motion turns, or heads off +x
-CLOSED = 0.3  # rad between the last pose and the first of a motion that loops
 STEADY = 0.9  # correlation of a gait with itself a stride later
 SLOW, FAST = 0.55, 1.8  # of the speed that strides suggest: walks and runs at their own rate are within
 SMOOTHING = 0.07  # s, half of the window over which accelerations are fitted for the torques
@@ -184,8 +183,7 @@ def unsuited(robot: Robot, clip: MotionClip, *, axes: str, reset: str, seconds: 
             f"the motion heads {np.degrees(ahead):.0f}° from +x, and episodes start in the fixed pose, which looks "
             "along +x: `fmpjax motion import --heading 0` turns the motion"
         )
-    last, target = clip.qpos[-1], loop_target(clip)
-    if clip.duration < seconds and np.abs(last[7:] - target[7:]).max() > CLOSED:
+    if clip.duration < seconds and not loops(clip):
         said.append(
             f"the motion lasts {clip.duration:.1f} s and does not loop, and an evaluation lasts {seconds:g} s: "
             "it does not say what the policy should do after that"

@@ -13,6 +13,7 @@ from fmpjax.motion.soles import sole_points
 from fmpjax.robots import CONTACT_DEPTH, Robot
 
 BLEND = 0.4  # s, over which a loop is closed
+CLOSED = 0.3  # rad between the last pose and the first of a motion that loops
 LOW = 5  # per cent of the samples may have the lowest sole below the floor after a shift
 SIDES = {"left_": "right_", "right_": "left_"}
 
@@ -72,6 +73,11 @@ def loop_target(clip: MotionClip) -> np.ndarray:
     turned = rotations.yaw(last[3:7]) - rotations.yaw(target[3:7])
     target[3:7] = rotations.multiply(rotations.exp_map(np.array([0.0, 0.0, turned])), target[3:7])
     return target
+
+
+def loops(clip: MotionClip) -> bool:
+    """Whether the clip ends in the pose that it begins with, so that it can go on from there."""
+    return bool(np.abs(clip.qpos[-1, 7:] - loop_target(clip)[7:]).max() <= CLOSED)
 
 
 def looped(clip: MotionClip) -> MotionClip:

@@ -227,14 +227,24 @@ def test_the_form_of_an_observation_counts_the_motions(robot):
 
 
 @pytest.fixture(scope="module")
-def phased(robot, walk):
+def part(walk):
+    """Half of a stride more than two, which does not end as it begins."""
+    return motion.MotionClip.from_qpos("part", walk.robot, walk.rate, walk.qpos[:130])
+
+
+def timed(robot, clip):
     changes = {"command.kind": "phase", "env.axes": "heading", "features.axes": "heading", "env.first_cap": 1000}
     settings = preset("smoke", **changes)
-    return Env(robot, walk, settings, physics.make(robot, settings.physics))
+    return Env(robot, clip, settings, physics.make(robot, settings.physics))
 
 
-def test_the_phase_goes_on_and_ends_the_episode_with_the_clip(phased, walk):
-    last = len(walk) - 1
+@pytest.fixture(scope="module")
+def phased(robot, part):
+    return timed(robot, part)
+
+
+def test_the_phase_goes_on_and_ends_the_episode_with_the_clip(phased, part):
+    last = len(part) - 1
     state = phased.command.begin(jnp.array([0, last - 2, last + 1]), ())
     np.testing.assert_array_equal(state, [0, last - 2, 0])
     seen = phased.command.observe(jnp.array([0, last // 4, last]))
@@ -250,6 +260,24 @@ def test_the_phase_goes_on_and_ends_the_episode_with_the_clip(phased, walk):
     state, over, _ = phased.command.advance(state, None, frame)
     assert state.tolist() == [1, last - 1, 1] and not over.any()
     assert phased.command.advance(state, None, frame).over.tolist() == [False, True, False]
+
+
+def test_the_phase_of_a_loop_begins_again(robot, walk):
+    """Its last pose is its first one, and no episode ends there."""
+    command, last = timed(robot, walk).command, len(walk) - 1
+    state = command.begin(jnp.array([last - 2, last, last + 1]), ())
+    assert state.tolist() == [last - 2, 0, 0]
+    frame = jnp.zeros((3, FrameLayout.of(robot).size))
+    rows = []
+    for _ in range(4):
+        state, over, _ = command.advance(state, None, frame)
+        rows.append(state.tolist())
+        assert not over.any()
+    assert rows == [[last - 1, 1, 1], [0, 2, 2], [1, 3, 3], [2, 4, 4]]
+    np.testing.assert_array_equal(command.wanted(jnp.array([last - 1])), 0)
+    joints = walk.qpos[:, 7:]
+    seen = command.observe(jnp.array([last - 1]))
+    np.testing.assert_allclose(seen[0, 5:], joints[last] - joints.mean(0), atol=1e-5)
 
 
 def test_a_phase_earns_all_for_the_demonstration_and_less_for_what_is_off(phased):

@@ -12,6 +12,7 @@ from fmpjax import cli, following, robots, runs
 from fmpjax.config import preset
 from fmpjax.errors import UserError
 from fmpjax.frames import FrameLayout
+from fmpjax.motion import MotionClip
 from fmpjax.trainer import Trainer
 from tests.helpers import TINY, settings
 
@@ -79,15 +80,21 @@ def test_key_points_are_in_the_own_heading():
     np.testing.assert_allclose(found[0, :2], [[2, 0, 0.5], [0, 3, 0.7]], atol=1e-6)
 
 
-def test_what_is_wanted_is_the_frame_after_the_step(monkeypatch, walk):
-    """A robot that is put on the clip's next frame at each step has no error, and one on the frame before has."""
-    trainer = Trainer(preset("smoke", **TINY, **{"command.kind": "phase"}), walk)
+@pytest.mark.parametrize("loops", [True, False])
+def test_what_is_wanted_is_the_frame_after_the_step(monkeypatch, walk, loops):
+    """A robot that is put on the clip's next frame at each step has no error, and one on the frame before has.
+
+    A clip that loops is compared until it begins again.
+    """
+    clip = walk if loops else MotionClip.from_qpos("part", walk.robot, walk.rate, walk.qpos[:120])
+    trainer = Trainer(preset("smoke", **TINY, **{"command.kind": "phase"}), clip)
+    last = len(clip) - 1
     frames, qpos = trainer.env.clip_frames, jnp.asarray(trainer.env.library.qpos, jnp.float32)
 
     def play(late):
         def step(trainer, env, policy, now, alive, drawn):
             command, over, _ = env.command.advance(now.command, None, now.observed.frame)
-            row = command - late
+            row = jnp.where(command < now.command, last, command) - late
             observed = now.observed._replace(frame=frames[row])
             physics = now.physics._replace(qpos=qpos[row])
             now = now._replace(command=command, observed=observed, physics=physics)
@@ -101,7 +108,7 @@ def test_what_is_wanted_is_the_frame_after_the_step(monkeypatch, walk):
 
     right, late = play(0), play(1)
     following._play.clear_cache()
-    assert right.finished == 3
+    assert right.finished == 3 and right.seconds == pytest.approx(clip.duration)
     assert max(right.joint_error, right.root_error, right.height_error, right.key_point_error) < 1e-6  # float32's
     assert right.excursion == pytest.approx(1.0, abs=1e-6)
     assert late.joint_error > 1e-3 and late.root_error == pytest.approx(0.86 / 50, rel=0.1)
