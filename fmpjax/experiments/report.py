@@ -75,16 +75,19 @@ def gather(folder: Path) -> list[Section]:
 def _benchmark(folder: Path) -> Section | None:
     """The section of the benchmark; None where there is none, as a page on the paper does not miss it."""
     title = "The benchmark: methods by motions, resets and seeds"
-    found = _section(
-        folder, title, benchmark.NAME, "", f"{benchmark.NAME}.json", f"{benchmark.NAME}.png",
-        lambda record: (comparison.table(record), []),
-    )  # fmt: skip
+    sentences: list[str] = []
+
+    def read(record: dict[str, Any]) -> tuple[Table, list[Verdict]]:
+        sentences.extend(comparison.sentences(record))
+        return comparison.table(record), []
+
+    found = _section(folder, title, benchmark.NAME, "", f"{benchmark.NAME}.json", f"{benchmark.NAME}.png", read)
     if found.source is None:
         return None
     drawn = found.source.with_name(f"{benchmark.NAME}_courses.png")
     return found._replace(
         lines=explorer.read(found.source.with_suffix(".csv")),
-        sentences=comparison.sentences(json.loads(found.source.read_text())),
+        sentences=sentences,
         courses=drawn if drawn.exists() else None,
     )
 

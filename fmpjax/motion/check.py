@@ -10,7 +10,7 @@ from scipy.signal import savgol_filter
 
 from fmpjax import rotations, tables
 from fmpjax.motion.clip import MotionClip
-from fmpjax.motion.edit import loop_target, loops
+from fmpjax.motion.edit import loop_gap, loops
 from fmpjax.motion.soles import slides, sole_points
 from fmpjax.robots import Robot
 
@@ -105,8 +105,6 @@ def check(robot: Robot, clip: MotionClip, flips: int = 0) -> list[Figure]:
 
 def _whole(clip: MotionClip, flips: int) -> dict[str, Figure]:
     """Figures that only the whole clip has, by name."""
-    target, last = loop_target(clip), clip.qpos[-1]
-    gap = np.linalg.norm(rotations.log_map(rotations.multiply(rotations.conjugate(last[3:7]), target[3:7])))
     facing = float(np.degrees(rotations.yaw(np.asarray(clip.qpos[0, 3:7]))))
     figures = (
         Figure("duration", clip.duration),
@@ -115,7 +113,7 @@ def _whole(clip: MotionClip, flips: int) -> dict[str, Figure]:
         Figure("heading", float(np.degrees(heading(clip))), f"faces {facing:.0f}°"),
         Figure("turning", clip.turning, f"{np.degrees(spread(clip)):.0f}° at most from the first heading"),
         Figure("flips", flips, "taken out on reading" if flips else ""),
-        Figure("loop gap", float(max(gap, np.abs(last[7:] - target[7:]).max()))),
+        Figure("loop gap", loop_gap(clip)),
     )
     return {figure.name: figure for figure in figures}
 

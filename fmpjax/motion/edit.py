@@ -75,9 +75,16 @@ def loop_target(clip: MotionClip) -> np.ndarray:
     return target
 
 
+def loop_gap(clip: MotionClip) -> float:
+    """The greatest angle between the last pose and the first, of the joints and of the root's tilt, rad."""
+    target, last = loop_target(clip), clip.qpos[-1]
+    tilt = np.linalg.norm(rotations.log_map(rotations.multiply(rotations.conjugate(last[3:7]), target[3:7])))
+    return float(max(tilt, np.abs(last[7:] - target[7:]).max()))
+
+
 def loops(clip: MotionClip) -> bool:
     """Whether the clip ends in the pose that it begins with, so that it can go on from there."""
-    return bool(np.abs(clip.qpos[-1, 7:] - loop_target(clip)[7:]).max() <= CLOSED)
+    return loop_gap(clip) <= CLOSED
 
 
 def looped(clip: MotionClip) -> MotionClip:

@@ -66,7 +66,8 @@ def folder_of(trainer: Trainer) -> Path | None:
 def pretrain(trainer: Trainer, folder: Path, progress: Progress, *, again: bool = False) -> Any:
     """What the trainer's method learns before any policy: what a folder holds or, where it holds none, trained now.
 
-    One process at a time trains it; those that begin meanwhile wait, and read it.
+    One process at a time trains it; those that begin meanwhile wait, and read it. Where the file system has no locks,
+    each trains.
 
     Args:
       trainer: of a method with a pretraining.
@@ -79,9 +80,11 @@ def pretrain(trainer: Trainer, folder: Path, progress: Progress, *, again: bool 
     """
     lock = FileLock(folder.with_name(f".{folder.name}.lock"))
     try:
-        with contextlib.suppress(Timeout):
+        try:
             lock.acquire(timeout=0)
-        if not lock.is_locked:
+        except NotImplementedError:
+            progress.note(f"{folder.parent} has no locks: runs that start together pretrain each for itself")
+        except Timeout:
             progress.note(f"another process pretrains {trainer.config.method} on the demonstration: waiting for it")
             lock.acquire()
         return _pretrain(trainer, folder, progress, again)

@@ -40,18 +40,16 @@ def test_a_course_has_means_since_the_evaluation_before(tmp_path):
     assert math.isnan(first["discriminator_loss"]) and math.isnan(first["training_reward"])
 
 
-def test_courses_are_drawn_for_methods_that_have_different_figures(tmp_path):
+def test_courses_are_drawn_for_methods_that_have_different_figures(tmp_path, monkeypatch):
     """A curve for each figure of each cell and one for their mean; none for what a method does not have."""
     planned = [cell(tmp_path, seed=seed) for seed in (0, 1)]
     planned += [cell(tmp_path, "amp", seed, agent_accuracy=(0.5, 0.6, 0.9, 1.0)) for seed in (0, 1)]
     planned.append(cell(tmp_path, "pwil", margins=(math.nan,) * 4))
     rows = [row for each in planned for row in courses.course(each, tmp_path)]
     drawn = []
-    courses.Figure.savefig, before = lambda figure, path: drawn.append(figure), courses.Figure.savefig
-    try:
+    with monkeypatch.context() as patch:
+        patch.setattr(courses.Figure, "savefig", lambda figure, path: drawn.append(figure))
         courses.draw(rows, tmp_path / "courses.png")
-    finally:
-        courses.Figure.savefig = before
     curves = [len(panel.lines) for panel in drawn[0].axes]
     assert curves == [6, 9, 4, 3, 3, 0]  # quality and falls, of amp also the accuracy; the margin
     (mean,) = (line for line in drawn[0].axes[1].lines if line.get_linewidth() > 1 and line.get_color() == "C0")

@@ -357,6 +357,14 @@ def test_the_report_holds_the_benchmark(tmp_path):
     assert "dataset, equal transitions: FMP" in text
     said = "dataset reset, equal wall time: nothing is claimed of AMP and FMP"
     assert f"- {said}" in text and f"<li>{said}" in page and page.count("<img") == 0
+    # One of an earlier version, without the sign test, is refused in a sentence.
+    earlier = record([result(m, s, q) for m, q in (("fmp", 0.5), ("amp", 0.6)) for s in range(5)])
+    for line in earlier["improvements"]:
+        del line["p"]
+    (tmp_path / "earlier").mkdir()
+    (tmp_path / "earlier" / "benchmark.json").write_text(json.dumps(earlier | {"provenance": PROVENANCE}))
+    with pytest.raises(UserError, match="benchmark.json is no result of this version"):
+        report.gather(tmp_path / "earlier")
     (tmp_path / "benchmark_courses.png").write_bytes(b"picture")
     report.write(tmp_path, tmp_path / "report.html")
     assert (tmp_path / "report.html").read_text().count("<img") == 1

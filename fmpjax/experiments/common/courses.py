@@ -31,7 +31,10 @@ _COLORS = {"quality": "C0", "training_falls": "C3", "agent_accuracy": "C2", "exp
 
 
 def course(cell: Cell, folder: Path) -> list[dict[str, Any]]:
-    """The course of a cell's run, a row an evaluation, for a CSV file; falls in per cent of the episodes."""
+    """The course of a cell's run, a row an evaluation, for a CSV file.
+
+    ``falls`` are per cent of the episodes, ``training_falls`` a share. What a method does not have is NaN.
+    """
     lines, rows, since = MetricsLog.read(folder / cell.name / "metrics.csv"), [], 0
     columns = {name: f"fit/{name}" for name in SIGNS} | {f"training_{name}": f"train/{name}" for name in TRAINING}
     for evaluation in evaluations(cell, folder):
