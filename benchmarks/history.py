@@ -6,7 +6,9 @@ machine cannot be compared. A line for each measurement goes to a CSV file that 
 - ``laptop``, ``paper``: time of a training iteration over that of the baseline (`throughput.py`); the lowest and the
   highest of the pairs are beside the median;
 - ``cores``: rate of `laptop` on all cores over its rate on one, this checkout alone;
-- ``first``: wall time of `make train PRESET=smoke` the second time, when its programs are compiled already, in seconds.
+- ``first``: wall time of `make train PRESET=smoke` the second time, when its programs are compiled already, in seconds;
+- ``run``, ``memory``: wall time and peak memory of a run of 0.7 M transitions of `laptop`, with its evaluation and its
+  film, over those of the baseline. Both have trained once before.
 
 The baseline is checked out into a temporary folder and runs with the packages of this environment.
 """
@@ -49,20 +51,25 @@ def checked_out(commit: str) -> Generator[Path]:
             git("worktree", "remove", "--force", str(path))
 
 
-def run(checkout: Path, *arguments: str, prefix: tuple[str, ...] = ()) -> float:
-    """Seconds that a Python command of a checkout takes.
+def run(checkout: Path, *arguments: str, prefix: tuple[str, ...] = ()) -> tuple[float, float]:
+    """Seconds that a Python command of a checkout takes, and its peak memory.
+
+    The memory is the largest of the process and of those that it started, in the system's unit.
 
     Raises:
       SystemExit: it fails; its last lines are shown.
     """
     environment = os.environ | {"PYTHONPATH": str(checkout), "JAX_PLATFORMS": "cpu"}
-    began = time.perf_counter()
-    done = subprocess.run(
-        [*prefix, sys.executable, *arguments], cwd=checkout, env=environment, capture_output=True, text=True
-    )
-    if done.returncode:
-        raise SystemExit(f"{' '.join(arguments)} in {checkout}: {(done.stdout + done.stderr)[-1000:]}")
-    return time.perf_counter() - began
+    command = [*prefix, sys.executable, *arguments]
+    with tempfile.TemporaryFile("w+") as printed:
+        began = time.perf_counter()
+        process = subprocess.Popen(command, cwd=checkout, env=environment, stdout=printed, stderr=subprocess.STDOUT)
+        _, status, used = os.wait4(process.pid, 0)  # which tells the memory of this process, not of all there were
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            printed.seek(0)
+            raise SystemExit(f"{' '.join(arguments)} in {checkout}: {printed.read()[-1000:]}")
+        return time.perf_counter() - began, used.ru_maxrss
 
 
 def iteration(checkout: Path, preset: str, calls: int, prefix: tuple[str, ...] = ()) -> float:
@@ -100,8 +107,19 @@ def measure(arguments: argparse.Namespace) -> Iterator[dict[str, object]]:
         with tempfile.TemporaryDirectory() as folder:
             command = ("-m", "fmpjax.cli", "train", "--preset", "smoke", "--run")
             run(ROOT, *command, f"{folder}/0")
-            taken = [run(ROOT, *command, f"{folder}/{i + 1}") for i in range(arguments.rounds)]
+            taken = [run(ROOT, *command, f"{folder}/{i + 1}")[0] for i in range(arguments.rounds)]
         yield row("first", taken, "s")
+    if arguments.run:
+        command = ("-m", "fmpjax.cli", "train", "--preset", "laptop", "--transitions", "700000", "--run")
+        with checked_out(arguments.baseline) as baseline, tempfile.TemporaryDirectory() as folder:
+            checkouts = {"there": baseline, "here": ROOT}
+            used = [
+                [run(checkout, *command, f"{folder}/{side}{i}") for side, checkout in checkouts.items()]
+                for i in range(arguments.rounds + 1)
+            ]
+        there, here = np.array(used[1:]).swapaxes(0, 1)
+        for measured, of, ratios in zip(("run", "memory"), ("time", "memory"), (here / there).T, strict=True):
+            yield row(measured, list(ratios), f"of the baseline's {of}")
 
 
 def main() -> None:
@@ -114,6 +132,7 @@ def main() -> None:
     parser.add_argument("--calls", type=int, default=5, help="calls of the compiled program in a process")
     parser.add_argument("--cores", action=argparse.BooleanOptionalAction, default=True, help="compare with one core")
     parser.add_argument("--first", action=argparse.BooleanOptionalAction, default=True, help="time a second short run")
+    parser.add_argument("--run", action=argparse.BooleanOptionalAction, default=True, help="compare runs of 0.7 M")
     parser.add_argument("--csv", type=Path, default=ROOT / "experiments/results/throughput/history.csv")
     arguments = parser.parse_args()
     changed = "+" if git("status", "--porcelain", "--untracked-files=no") else ""

@@ -70,20 +70,21 @@ def cache_folder(*names: str) -> Path | None:
 
 def processor() -> str:
     """The name of the processor, as far as the system knows it."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    named = (line.partition(":")[2].strip() for line in _cpuinfo() if line.startswith("model name"))
+    return next(named, "") or platform.processor() or platform.machine()
 
 
 def _processor() -> str:
     """What tells kinds of processors apart."""
-    told = [platform.machine(), platform.processor()]
+    told = {line for line in _cpuinfo() if line.startswith(("model name", "flags", "Features"))}
+    return "\n".join([platform.machine(), platform.processor(), *sorted(told)])
+
+
+def _cpuinfo() -> list[str]:
+    """The lines in which Linux describes its processors; none on another system."""
     with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        told += sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
-    return "\n".join(told)
+        return Path("/proc/cpuinfo").read_text().splitlines()
+    return []
 
 
 def import_mujoco() -> None:
