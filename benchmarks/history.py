@@ -8,7 +8,7 @@ machine cannot be compared. A line for each measurement goes to a CSV file that 
 - ``cores``: rate of `laptop` on all cores over its rate on one, this checkout alone;
 - ``first``: wall time of `make train PRESET=smoke` the second time, when its programs are compiled already, in seconds;
 - ``run``, ``memory``: wall time and peak memory of a run of 0.7 M transitions of `laptop`, with its evaluation and its
-  film, over those of the baseline. Both have trained once before.
+  film, over those of the baseline. Both have trained once before; the baseline compiles every time.
 
 The baseline is checked out into a temporary folder and runs with the packages of this environment.
 """
@@ -64,7 +64,7 @@ def run(checkout: Path, *arguments: str, prefix: tuple[str, ...] = ()) -> tuple[
     with tempfile.TemporaryFile("w+") as printed:
         began = time.perf_counter()
         process = subprocess.Popen(command, cwd=checkout, env=environment, stdout=printed, stderr=subprocess.STDOUT)
-        _, status, used = os.wait4(process.pid, 0)  # which tells the memory of this process, not of all there were
+        _, status, used = os.wait4(process.pid, 0)  # `resource` knows only the largest of all children so far
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
             printed.seek(0)
