@@ -33,10 +33,14 @@ class Evaluate:
     """Measure how well a policy obeys its command: velocities, the time in the clip or motions; docs/steering.md."""
     robust: bool = False
     """Measure how often a policy falls under pushes, delays and other disturbances; docs/robustness.md."""
+    disturbances: Annotated[tuple[str, ...], default("all")] = ()
+    """With --robust, the disturbances to play, such as push delay together."""
 
     def __call__(self) -> None:
         if self.commands and self.robust:
             raise UserError("--commands and --robust are two evaluations: expected one of them")
+        if self.disturbances and not self.robust:
+            raise UserError("--disturbances goes with --robust")
         if self.episodes is not None and self.episodes < 1:
             raise UserError(f"--episodes is {self.episodes}: expected at least 1")
         run = runs_module().Run.open(self.run)
@@ -82,9 +86,16 @@ class Evaluate:
         from fmpjax.viz import bars
 
         episodes = self.episodes or robustness.EPISODES
+        robustness.chosen(trainer.config, self.disturbances)
         print(f"compiling the episodes, {episodes} of each case; each case takes seconds ...", flush=True)
         print(f"iteration {int(state.iteration):,}:\n{robustness.heading()}")
-        found = robustness.measure(trainer, state.ppo, episodes=episodes, note=lambda line: print(line, flush=True))
+        found = robustness.measure(
+            trainer,
+            state.ppo,
+            episodes=episodes,
+            disturbances=self.disturbances,
+            note=lambda line: print(line, flush=True),
+        )
         title = f"{run.folder.resolve().name}: first episodes of {found.seconds:g} s, {episodes} per bar"
         self._save(run, "robustness", found, bars.draw, robustness.bars(found), title)
 

@@ -1,6 +1,7 @@
 """How well a policy stays up: its falls, speed and excursion under each disturbance alone, and under all together."""
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 from fmpjax import frozen, jsons, metrics, physics, rotations, tables
 from fmpjax.config import Config, DisturbanceConfig
 from fmpjax.env import Env, EnvState
+from fmpjax.errors import UserError
 from fmpjax.evaluate import episodes_of, planar_speed
 from fmpjax.ppo import PPOState
 from fmpjax.trainer import Trainer
@@ -205,20 +207,43 @@ class Player:
         return jax.lax.scan(step, under_way, env.disturbance_draws(key, self.chunk, self.count))
 
 
-def measure(trainer: Trainer, state: PPOState, *, episodes: int = EPISODES, note: Any = None) -> Robustness:
+def chosen(config: Config, disturbances: Sequence[str]) -> list[Case]:
+    """The cases of the named disturbances, all of them where none is named.
+
+    Raises:
+      UserError: no case has such a disturbance.
+    """
+    every = cases(config)
+    names = dict.fromkeys(case.disturbance for case in every)
+    for name in disturbances:
+        if name not in names:
+            raise UserError(f"unknown disturbance {name!r}: expected some of {', '.join(map(repr, names))}")
+    return [case for case in every if not disturbances or case.disturbance in disturbances]
+
+
+def measure(
+    trainer: Trainer,
+    state: PPOState,
+    *,
+    episodes: int = EPISODES,
+    disturbances: Sequence[str] = (),
+    note: Any = None,
+) -> Robustness:
     """Play the deterministic policy under every case and measure it.
 
     Args:
       trainer: of the run.
       state: of the policy.
       episodes: per case.
+      disturbances: names of those to play; none for all.
       note: called with a line after each case; None for silence.
 
     Raises:
-      UserError: the robot has no torso whose mass could differ.
+      UserError: the robot has no torso whose mass could differ, or no case has a disturbance of that name.
     """
+    wanted = chosen(trainer.config, disturbances)
     player, cells = Player(trainer, episodes), []
-    for case in cases(trainer.config):
+    for case in wanted:
         cells.append(_cell(trainer, case, player.play(state, case.config)))
         if note:
             note(table(cells[-1:]))

@@ -7,6 +7,7 @@ import pytest
 
 from fmpjax import cli, robustness, runs
 from fmpjax.config import Config, DisturbanceConfig, preset
+from fmpjax.errors import UserError
 from fmpjax.trainer import Trainer
 from fmpjax.viz import bars
 from tests.helpers import tiny
@@ -95,6 +96,21 @@ def test_the_command_writes_figures_and_a_picture(tmp_path, monkeypatch, capsys)
 
 
 robustness_cases = robustness.cases
+
+
+def test_disturbances_are_chosen_by_name():
+    config = preset("laptop")
+    found = robustness.chosen(config, ("together", "push"))
+    assert [case.disturbance for case in found] == ["push"] * 3 + ["together"] * 2
+    assert robustness.chosen(config, ()) == robustness.cases(config)
+    with pytest.raises(UserError, match="unknown disturbance 'wind': expected some of 'none', 'push', 'push, turning'"):
+        robustness.chosen(config, ("wind",))
+
+
+def test_disturbances_without_their_evaluation_are_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["evaluate", str(tmp_path), "--disturbances", "push"])
+    assert "--disturbances goes with --robust" in capsys.readouterr().err
 
 
 def test_two_evaluations_at_once_are_refused(tmp_path, capsys):

@@ -12,7 +12,7 @@ STUDIES = {
     "benchmark": "Run the benchmark of all methods, and continue it when it is started again.",
     "curvature": "Compare the score and the barycentric reward halfway between two atoms.",
     "generalization": "Fit FMP, Endpoint and Value to a standing policy's windows, and measure them beyond these.",
-    "ranking": "Rank the demonstration and spoiled copies of it under a reward fitted to a policy's windows.",
+    "ranking": "Rank the demonstration and spoiled copies of it under a fitted or a learned reward.",
     "standing": "Measure why a policy stands before it walks.",
     "static_teacher": "Fit FMP with dynamic and with static path supervision, and compare them.",
 }

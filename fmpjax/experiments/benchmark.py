@@ -15,7 +15,7 @@ import tyro
 
 from fmpjax import priors
 from fmpjax.errors import UserError
-from fmpjax.experiments.common import cells, comparison, courses, results, scores, table
+from fmpjax.experiments.common import cells, comparison, courses, measured, results, scores, table
 from fmpjax.experiments.common.cells import Cell, Specification
 from fmpjax.motion import library
 from fmpjax.shell import default
@@ -53,6 +53,8 @@ def main(
     smoke: bool = False,
     workers: int = 1,
     together: bool = False,
+    measure: bool = True,
+    keep: bool = True,
     cluster: str = "none",
     slurm: tuple[str, ...] = (),
 ) -> None:
@@ -71,6 +73,8 @@ def main(
       smoke: two methods and two motions with a budget that teaches nothing, in minutes.
       workers: cells that run at once; on one machine each has its share of the cores.
       together: train all seeds of a method, reset and motion as one program, which pays on an accelerator.
+      measure: measure each trained cell's falls under disturbances and what its reward prefers; a minute or two.
+      keep: keep the checkpoints of finished cells; without them 0.1 MB of a cell are left, which can be committed.
       cluster: where cells run; `none`: processes of this machine, `slurm`: an array, `local`: the same without SLURM.
       slurm: options of the array as submitit names them, such as partition=gpu gpus_per_node=1 timeout_min=600.
     """
@@ -82,20 +86,24 @@ def main(
     changed["settings"] = {**start.settings, **_settings(set)}
     defaults = () if only else MOTIONS[:2] if smoke else MOTIONS
     planned = plan(dataclasses.replace(start, **changed), [*defaults, *motion])
+    if measure:
+        planned = [measured.of(cell, smoke=smoke) for cell in planned]
     results.check_folder(out)
     failed = None
     try:
-        cells.run(planned, out, workers, together=together, cluster=cluster, options=slurm)
+        cells.run(planned, out, workers, together=together, cluster=cluster, options=slurm, keep=keep)
     except UserError as error:
         failed = error
-    # Also where cells failed, of those that did not.
     if any(cells.finished(cell, out) for cell in planned):
-        paths = write(planned, out)
-        print((out / f"{NAME}.md").read_text())
-        for path in paths:
-            print(f"wrote {path}")
-    if failed:
+        _tell(write(planned, out), out)
+    if failed:  # the results are of those that did not
         raise failed
+
+
+def _tell(paths: Sequence[Path], folder: Path) -> None:
+    print((folder / f"{NAME}.md").read_text())
+    for path in paths:
+        print(f"wrote {path}")
 
 
 def _settings(given: Sequence[str]) -> dict[str, str]:
@@ -154,8 +162,13 @@ def write(planned: Sequence[Cell], folder: Path) -> list[Path]:
     text = [results.markdown(comparison.table(record)), *(f"- {line}" for line in comparison.sentences(record))]
     (folder / f"{NAME}.md").write_text("\n".join([text[0], "", *text[1:]]) + "\n")
     rows = [row for cell in finished for row in courses.course(cell, folder)]
+    lists = {
+        "robustness": [row for cell in finished for row in measured.robust(cell, folder)],
+        "ranking": [row for cell in finished for row in measured.ranking(cell, folder)],
+    }
     return [
         *paths,
+        *(results.write_csv(folder / f"{NAME}_{name}.csv", lines) for name, lines in lists.items() if lines),
         folder / f"{NAME}.md",
         *comparison.draw(record, found, [folder / f"{NAME}.png"]),
         results.write_csv(folder / f"{NAME}_courses.csv", rows),
@@ -183,6 +196,8 @@ def notes(record: Mapping[str, Any]) -> list[str]:
         "intervals, stratified by motion; the last column counts pairs of the same motion and seed.",
         "Falls at a size are of starts with joint noise of that deviation; all other figures are of the starts that "
         "docs/metrics.md calls the headline's.",
+        "Falls when pushed, delayed, slipping and under all together, and how often the reward prefers the "
+        "demonstration to its spoiled copies, are of the last policy alone, where they were measured.",
     ]
     if len(record["machines"]) != 1:
         found.append(

@@ -24,7 +24,7 @@ _CURVES = ("metrics.csv", "curves.png")
 # Figures of a policy and their pictures. Those of the newest one have -last in their names: `fmpjax evaluate --last`.
 _FIGURES = (
     "evaluation.json steering.json following.json performing.json robustness.json ranking-start.json ranking.json "
-    "steering.png following.png performing.png robustness.png"
+    "ranking-learned.json steering.png following.png performing.png robustness.png"
 ).split()
 _FILMS = ("frames.png", "policy.mp4", "policy.gif", "course.mp4", "pushed.mp4")  # of the best policy
 

@@ -1,6 +1,7 @@
 """The benchmark: its plan, cells that survive a kill and run once, here and on a cluster, and a prior that joins."""
 
 import csv
+import dataclasses
 import json
 import os
 import re
@@ -8,6 +9,7 @@ import signal
 import sys
 import time
 
+import numpy as np
 import pytest
 from filelock import FileLock
 
@@ -15,9 +17,9 @@ from fmpjax import config as configuration
 from fmpjax import priors
 from fmpjax.errors import UserError
 from fmpjax.experiments import benchmark
-from fmpjax.experiments.common import cells, engines
+from fmpjax.experiments.common import cells, engines, measured, scores
 from fmpjax.experiments.common.cells import Specification
-from fmpjax.experiments.common.work import Task
+from fmpjax.experiments.common.work import RUN, Measure, Task
 from tests.helpers import TINY
 
 SMALL = {key: ",".join(map(str, v)) if isinstance(v, tuple) else v for key, v in TINY.items()}
@@ -116,6 +118,55 @@ def test_a_cell_that_another_process_has_is_refused(tmp_path, monkeypatch):
     with FileLock(tmp_path / "fmp-dataset-walk" / "seed0.lock"):
         with pytest.raises(UserError, match="cell fmp-dataset-walk/seed0 is being run by another process: wait"):
             mine.run()
+
+
+def test_a_trained_cell_is_measured_once_and_loses_its_checkpoints_where_they_are_not_kept(tmp_path, monkeypatch):
+    """What was finished without checkpoints stays as it is: nothing can be measured of it any more."""
+    ran = []
+
+    def command(self, arguments):
+        ran.append(list(arguments))
+        (tmp_path / self.cells[0] / "figures.json").write_text("{}")
+
+    monkeypatch.setattr(Task, "_command", command)
+    mine = dataclasses.replace(task(tmp_path), measures=(Measure("figures.json", ("evaluate", RUN, "--robust")),))
+    run = tmp_path / mine.cells[0]
+    assert mine.done()  # there is no checkpoint to measure
+    (run / "checkpoints" / "10").mkdir(parents=True)
+    assert not mine.done()
+    mine.run()
+    assert ran == [["evaluate", str(run), "--robust"]] and mine.done() and (run / "checkpoints").exists()
+    dropping = dataclasses.replace(mine, keep=False)
+    assert not dropping.done()
+    dropping.run()
+    assert len(ran) == 1 and dropping.done() and not (run / "checkpoints").exists()
+    assert (run / "evaluation.json").exists() and (run / "metrics.csv").exists()
+
+
+def test_a_measurement_that_fails_fails_the_cell(tmp_path, monkeypatch):
+    monkeypatch.setattr(Task, "_command", lambda self, arguments: None)
+    mine = dataclasses.replace(task(tmp_path), measures=(Measure("figures.json", ()),), keep=False)
+    (tmp_path / mine.cells[0] / "checkpoints").mkdir()
+    with pytest.raises(ChildProcessError, match=r"seed0 has no figures.json: see .*seed0.log"):
+        mine.run()
+    assert (tmp_path / mine.cells[0] / "checkpoints").exists() and not mine.done()
+
+
+def test_scores_of_what_was_measured():
+    robust = [
+        {"disturbance": "push", "size": "0.25 m/s", "episodes": 64, "falls": 8},
+        {"disturbance": "push", "size": "0.5 m/s", "episodes": 64, "falls": 24},
+        {"disturbance": "delay", "size": "10 ms", "episodes": 64, "falls": 64},
+    ]
+    ranking = [
+        {"windows": name, "beaten": beaten}
+        for name, beaten in (("demonstration", 0.5), ("frozen", 1.0), ("reversed", 0.6), ("pool", 0.9))
+    ]
+    found = measured.scores(robust, ranking)
+    assert found["falls_push"] == 25 and found["falls_delay"] == 100 and found["preferred"] == pytest.approx(80)
+    assert np.isnan(found["falls_friction"]) and np.isnan(measured.scores([], [])["preferred"])
+    assert set(found) <= {score.name for score in scores.SCORES}
+    assert [len(measured.of(cell).measures) for cell in small("fmp", "tracking")] == [2, 1]
 
 
 def test_a_seed_that_another_command_has_trained_is_not_begun_again(tmp_path):
@@ -250,9 +301,12 @@ def test_a_new_prior_is_one_file_and_one_line(tmp_path, monkeypatch):
     constant = __import__("constant")
     priors.register("constant", constant.make)
 
-    planned = small("constant")
-    for each in cells._tasks(planned, tmp_path / "out", together=False):
+    monkeypatch.setattr(measured, "EPISODES", 2)
+    monkeypatch.setattr(measured, "DISTURBANCES", ("push",))
+    planned = [measured.of(cell) for cell in small("constant")]
+    for each in cells._tasks(planned, tmp_path / "out", together=False, keep=False):
         each.run()
+        assert each.done()
     paths = benchmark.write(planned, tmp_path / "out")
     assert all(path.stat().st_size for path in paths)
     with (tmp_path / "out" / "benchmark.csv").open() as file:
@@ -261,6 +315,12 @@ def test_a_new_prior_is_one_file_and_one_line(tmp_path, monkeypatch):
         ("constant", "walk", "transitions"), ("constant", "walk", "seconds"),
     ]  # fmt: skip
     assert float(lines[0]["power"]) > 0 and float(lines[0]["action_rate"]) > 0 and float(lines[0]["joint_jerk"]) > 0
+    # A constant prefers nothing: every comparison is a tie. The last evaluation of both budgets is the only one.
+    assert float(lines[0]["preferred"]) == 50 and 0 <= float(lines[0]["falls_push"]) <= 100
+    with (tmp_path / "out" / "benchmark_robustness.csv").open() as file:
+        assert [row["size"] for row in csv.DictReader(file)] == ["0.25 m/s", "0.5 m/s", "1 m/s"]
+    assert (tmp_path / "out" / "benchmark_ranking.csv").exists()
+    assert not list((tmp_path / "out").glob("**/checkpoints"))
     record = json.loads((tmp_path / "out" / "benchmark.json").read_text())
     assert record["plan"]["methods"] == ["constant"] and record["cells"] == {"planned": 1, "finished": 1}
     assert str(tmp_path) not in json.dumps(record)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fmpjax import cli, features, motion, priors
 from fmpjax import config as configuration
-from fmpjax import features, motion, priors
 from fmpjax.errors import UserError
 from fmpjax.experiments import ranking
 from fmpjax.frames import FrameLayout
@@ -55,6 +55,30 @@ def test_demonstration_beats_frozen_and_slowed_copies_when_the_pool_stands(train
         assert result[name]["beaten"] > 0.75, name
     # The pool itself is the worst place to be: its median is the zero of the margin.
     assert good["margin"] > 1.0
+
+
+@pytest.mark.parametrize("method", ["amp", "pwil"])
+def test_a_learned_reward_of_any_method_is_ranked(method):
+    """An untrained discriminator and a greedy coupling: the second prefers the demonstration by its definition."""
+    config = configuration.preset("laptop", **{"env.count": 16, "method": method})
+    trainer = Trainer(config, motion.load("walk", rate=config.control_rate))
+    windows = standing_pool(trainer, 64)
+    valid = jnp.ones(windows.shape[:2], bool)
+    state = trainer.prior.init(jax.random.PRNGKey(0))
+    result = ranking.rank_learned(trainer, state, windows, valid)
+    assert set(result) == {*ranking.copies(trainer), "pool"} and "reward" not in result["frozen"]
+    # A window against itself is a coin's toss.
+    assert result["demonstration"]["beaten"] == pytest.approx(0.5, abs=0.03)
+    if method == "pwil":
+        assert all(result[name]["beaten"] > 0.9 for name in ("frozen", "reversed", "noisy (0.1 rad, 1 rad/s)"))
+        assert result["demonstration"]["margin"] > result["frozen"]["margin"] > 0
+    assert "frozen" in ranking.table(result)
+
+
+def test_two_rewards_at_once_are_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["experiment", "ranking", "--run", str(tmp_path), "--start", "--learned"])
+    assert "--start and --learned are two rewards: expected one of them" in capsys.readouterr().err
 
 
 def test_only_a_potential_is_ranked():

@@ -19,7 +19,7 @@ from fmpjax import priors
 from fmpjax.config import Config
 from fmpjax.errors import UserError
 from fmpjax.experiments.common import engines, work
-from fmpjax.experiments.common.work import Task
+from fmpjax.experiments.common.work import Measure, Task
 from fmpjax.logs import Progress, clock
 
 _POLL = 1.0  # s between looks at the running cells
@@ -51,6 +51,7 @@ class Cell:
     config: Config
     changes: Mapping[str, Any]  # by which the configuration departs from its preset
     pictures: bool = True  # whether it ends with frames and a film
+    measures: tuple[Measure, ...] = ()  # once it is trained
 
     @property
     def group(self) -> str:
@@ -163,6 +164,7 @@ def run(
     together: bool = False,
     cluster: str = "none",
     options: Sequence[str] = (),
+    keep: bool = True,
 ) -> None:
     """Run what is not finished yet, ``workers`` at once.
 
@@ -173,14 +175,17 @@ def run(
       together: train all seeds of a group in one process as one program, which pays on an accelerator.
       cluster: where they run, as `engines.make` takes it.
       options: of the cluster.
+      keep: the checkpoints of cells that are trained and measured.
 
     Raises:
       UserError: a folder holds another configuration (before anything runs), or cells failed (after all others ran).
     """
-    todo = [cell for cell in cells if not finished(cell, folder)]
+    for cell in cells:
+        finished(cell, folder)  # another configuration is refused before anything runs
+    todo = [cell for cell in cells if not _task([cell], folder, keep).done()]
     progress = Progress(30.0)
     progress.note(f"{len(cells)} cells, {len(cells) - len(todo)} of them finished before")
-    waiting, failed = _tasks(todo, folder, together), []
+    waiting, failed = _tasks(todo, folder, together, keep), []
     engine = engines.make(cluster, workers, folder, len(waiting), options)
     began, begun, ended = time.monotonic(), {}, 0
     before = {cell.name: work.iterations(folder / cell.name) for cell in todo}
@@ -193,7 +198,7 @@ def run(
             time.sleep(_POLL)
             now = engine.running()
             for task in engine.ended():
-                good = all(work.ended(folder / name, task.iterations) for name in task.cells)
+                good = task.done()
                 failed += [] if good else [task]
                 ended += len(task.cells) if good else 0
                 took = clock(time.monotonic() - begun[task.cells])
@@ -221,7 +226,14 @@ def _share(task: Task, done: Mapping[str, int]) -> float:
     return sum(done[name] for name in task.cells) / (len(task.cells) * task.iterations)
 
 
-def _tasks(todo: Sequence[Cell], folder: Path, together: bool) -> list[Task]:
+def _task(group: Sequence[Cell], folder: Path, keep: bool) -> Task:
+    """Cells that differ in their seeds alone, as one task."""
+    first = group[0]
+    names = tuple(cell.name for cell in group)
+    return Task(str(folder), names, first.config.iterations, tuple(first.command), first.measures, keep)
+
+
+def _tasks(todo: Sequence[Cell], folder: Path, together: bool, keep: bool = True) -> list[Task]:
     """Tasks for the cells to do; together, consecutive seeds of a group that have got as far are one."""
     groups: list[list[Cell]] = []
     for cell in sorted(todo, key=lambda cell: cell.config.seed) if together else todo:
@@ -233,7 +245,4 @@ def _tasks(todo: Sequence[Cell], folder: Path, together: bool) -> list[Task]:
                 break
         else:
             groups.append([cell])
-    return [
-        Task(str(folder), tuple(c.name for c in group), group[0].config.iterations, tuple(group[0].command))
-        for group in groups
-    ]
+    return [_task(group, folder, keep) for group in groups]

@@ -50,7 +50,7 @@ def samples(cells: Mapping[tuple[str, int], Result], score: str) -> list[np.ndar
     """A score's values, an array a motion, seeds in their order; those that are not defined are left out."""
     motions: dict[str, list[float]] = {}
     for (motion, _), result in sorted(cells.items()):
-        value = result.scores[score]
+        value = result.scores.get(score, math.nan)
         motions.setdefault(motion, []).extend([value] if math.isfinite(value) else [])
     return [np.array(values) for values in motions.values() if values]
 

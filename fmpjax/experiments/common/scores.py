@@ -7,13 +7,15 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fmpjax.config import Config
-from fmpjax.experiments.common import table
+from fmpjax.experiments.common import measured, table
 from fmpjax.experiments.common.cells import Cell
+from fmpjax.experiments.common.measured import DISTURBANCES
 from fmpjax.experiments.common.table import Row
 from fmpjax.metrics import pace_error
 
@@ -29,6 +31,7 @@ class Score(NamedTuple):
     better: int  # 1 where more is better, -1 where less is
 
 
+_SAID = ("falls, pushed", "delayed", "slipping", "all together")
 _SIZED = {f"falls_at_{size:g}": size for size in Config().evaluation_noise}  # rad, of the starts
 SCORES = (
     Score("quality", "quality", 3, 1),
@@ -44,6 +47,8 @@ SCORES = (
     Score("action_rate", "action rate, rad/s", 2, -1),
     Score("joint_jerk", "joint jerk, rad/s³", 0, -1),
     Score("power", "power, W", 0, -1),
+    *(Score(f"falls_{name}", f"{said}, %", 1, -1) for name, said in zip(DISTURBANCES, _SAID, strict=True)),
+    Score("preferred", "preferred, %", 0, 1),
 )
 BUDGETS = ("transitions", "seconds")  # what is equal
 
@@ -55,6 +60,7 @@ class History(NamedTuple):
     rows: list[Row]
     still: float  # degrees, amplitude error of a robot that holds still: the demonstration's own joint ranges
     machines: frozenset[str]  # that trained it
+    measured: Mapping[str, float] = MappingProxyType({})  # scores of the newest policy alone, of `measured.scores`
 
 
 class Result(NamedTuple):
@@ -82,7 +88,8 @@ def read(cell: Cell, folder: Path) -> History:
     made = json.loads((run / "provenance.json").read_text())
     ranges = json.loads((run / "evaluation.json").read_text())["expert_ranges"]
     machines = frozenset(map(_machine, (made, *made.get("resumed", []))))
-    return History(cell, table.evaluations(cell, folder), float(np.mean(ranges)), machines)
+    extra = measured.scores(measured.robust(cell, folder), measured.ranking(cell, folder))
+    return History(cell, table.evaluations(cell, folder), float(np.mean(ranges)), machines, extra)
 
 
 def _machine(made: Mapping[str, Any]) -> str:
@@ -152,9 +159,11 @@ def results(histories: Sequence[History]) -> list[Result]:
 
 def _result(history: History, row: Row, budget: str) -> Result:
     walked = time_to_walk([each for each in history.rows if each.transitions <= row.transitions])
+    newest = row.transitions == history.rows[-1].transitions
+    extra = {name: value if newest else math.nan for name, value in history.measured.items()}
     return Result(
         row.method, row.reset, row.variant, row.seed, budget, row.transitions, row.seconds,
-        scores(row, history.still, walked[0]), *walked,
+        scores(row, history.still, walked[0]) | extra, *walked,
     )  # fmt: skip
 
 

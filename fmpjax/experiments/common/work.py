@@ -1,4 +1,4 @@
-"""What the process of a cell does: train its run, or continue it, unless another process does so or it is finished.
+"""What the process of a cell does: train its run, or continue it, measure it, unless another process does so.
 
 The module imports no JAX, so that the process is on its cores before XLA counts them.
 """
@@ -9,14 +9,25 @@ import importlib
 import os
 import shutil
 import sys
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 from filelock import FileLock, Timeout
 
 from fmpjax.errors import UserError
 from fmpjax.logs import MetricsLog
+
+RUN = "RUN"  # in a measurement's arguments, the cell's folder
+CHECKPOINTS = ("checkpoints", "best")  # folders of a run's
+
+
+class Measure(NamedTuple):
+    """A command that measures a trained cell by its checkpoints."""
+
+    file: str  # that it writes into the cell's folder
+    arguments: tuple[str, ...]  # of `fmpjax`; the cell's folder takes the place of RUN
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +41,8 @@ class Task:
     cells: tuple[str, ...]  # their names, which are their run folders
     iterations: int  # of each cell's budget
     arguments: tuple[str, ...]  # of `fmpjax train`, but for the run's folder
+    measures: tuple[Measure, ...] = ()  # of each cell, once it is trained
+    keep: bool = True  # the checkpoints of a cell that is trained and measured
     cores: tuple[int, ...] = ()  # to run on; none for all
 
     @property
@@ -45,12 +58,25 @@ class Task:
                 os.dup2(log.fileno(), stream.fileno())
         self.run()
 
+    @property
+    def folders(self) -> list[Path]:
+        """The cells' run folders."""
+        return [Path(self.folder) / name for name in self.cells]
+
+    def trained(self) -> bool:
+        """Whether all cells have spent their budget and been evaluated."""
+        return all(ended(folder, self.iterations) for folder in self.folders)
+
+    def done(self) -> bool:
+        """Whether nothing is left to do; what was dropped with the checkpoints cannot be measured any more."""
+        return self.trained() and not any(self._missing(folder) or self._spare(folder) for folder in self.folders)
+
     def run(self) -> None:
-        """Train the cells to their end, where they are not there yet.
+        """Train the cells to their end, where they are not there yet, and measure them.
 
         Raises:
           UserError: another process has one of the cells, or had some of them.
-          ChildProcessError: the training failed, or was stopped; the log says why.
+          ChildProcessError: the training or a measurement failed, or was stopped; the log says why.
         """
         with contextlib.ExitStack() as locks:
             for name in self.cells:
@@ -60,8 +86,18 @@ class Task:
                     locks.enter_context(FileLock(path).acquire(timeout=0))
                 except Timeout:
                     raise UserError(f"cell {name} is being run by another process: wait for its end") from None
-            if not all(ended(Path(self.folder) / name, self.iterations) for name in self.cells):
+            if self.cores:
+                os.sched_setaffinity(0, self.cores)
+            if not self.trained():
                 self._train()
+            for folder in self.folders:
+                for measure in self._missing(folder):
+                    self._command(str(folder) if part == RUN else part for part in measure.arguments)
+                if left := self._missing(folder):
+                    raise ChildProcessError(f"{folder} has no {left[0].file}: see {self.log}")
+                if self._spare(folder):
+                    for name in CHECKPOINTS:
+                        shutil.rmtree(folder / name, ignore_errors=True)
 
     def checkpoint(self) -> Any:
         """For submitit: the same task again, which continues from the run's checkpoint."""
@@ -69,10 +105,25 @@ class Task:
 
         return DelayedSubmission(self)
 
+    def _missing(self, folder: Path) -> list[Measure]:
+        """The measurements that a cell has yet to have."""
+        if not _restorable(folder):
+            return []
+        return [measure for measure in self.measures if not (folder / measure.file).exists()]
+
+    def _spare(self, folder: Path) -> bool:
+        """Whether a cell has checkpoints that are not to be kept."""
+        return not self.keep and _restorable(folder)
+
+    def _command(self, arguments: Iterable[str]) -> None:
+        """Run `fmpjax`, as one would at a terminal; how it ends is in the log."""
+        arguments = list(arguments)
+        sys.argv = ["fmpjax", *arguments]  # what the run's provenance names
+        with contextlib.suppress(SystemExit):
+            importlib.import_module("fmpjax.cli").main(arguments)  # by its name: commands are above studies
+
     def _train(self) -> None:
-        if self.cores:
-            os.sched_setaffinity(0, self.cores)
-        folders = [Path(self.folder) / name for name in self.cells]
+        folders = self.folders
         begun = all((folder / "config.json").exists() for folder in folders)
         if not begun:
             if any(iterations(folder) for folder in folders if (folder / "config.json").exists()):
@@ -86,12 +137,14 @@ class Task:
         where = ["--run", str(folders[0])]
         if len(folders) > 1:
             where = ["--run", str(folders[0].parent), "--seeds", str(len(folders))]
-        arguments = [*self.arguments, *where, *(["--resume"] if begun else [])]
-        sys.argv = ["fmpjax", *arguments]  # what the run's provenance names
-        with contextlib.suppress(SystemExit):  # the log says why, and the run has not ended
-            importlib.import_module("fmpjax.cli").main(arguments)  # by its name: commands are above studies
-        if not all(ended(folder, self.iterations) for folder in folders):
+        self._command([*self.arguments, *where, *(["--resume"] if begun else [])])
+        if not self.trained():
             raise ChildProcessError(f"{self.cells[0]} did not come to its end: see {self.log}")
+
+
+def _restorable(run: Path) -> bool:
+    """Whether a run has its checkpoints."""
+    return any((run / name).exists() for name in CHECKPOINTS)
 
 
 def iterations(run: Path) -> int:
