@@ -74,7 +74,7 @@ def main(
       workers: cells that run at once; on one machine each has its share of the cores.
       together: train all seeds of a method, reset and motion as one program, which pays on an accelerator.
       measure: measure each trained cell's falls under disturbances and what its reward prefers; a minute or two.
-      keep: keep the checkpoints of finished cells; without them 0.1 MB of a cell are left, which can be committed.
+      keep: keep the checkpoints of finished cells; without them 0.2 MB of a cell are left, which can be committed.
       cluster: where cells run; `none`: processes of this machine, `slurm`: an array, `local`: the same without SLURM.
       slurm: options of the array as submitit names them, such as partition=gpu gpus_per_node=1 timeout_min=600.
     """
