@@ -114,7 +114,7 @@ def test_the_paper_s_program_never_leaves_the_device(walk):
 
     def lowered(backend, platform):
         trainer = Trainer(preset("paper", **few, **{"physics.backend": backend}), walk)
-        traced = jax.jit(trainer.iteration).trace(trainer.init())
+        traced = jax.jit(trainer.iteration).trace(trainer.shapes())
         return traced.lower(lowering_platforms=(platform,)).as_text()
 
     assert "fmpjax_native_" in lowered("native", "cpu")
