@@ -86,7 +86,6 @@ class Evaluate:
         from fmpjax.viz import bars
 
         episodes = self.episodes or robustness.EPISODES
-        robustness.chosen(trainer.config, self.disturbances)
         print(f"compiling the episodes, {episodes} of each case; each case takes seconds ...", flush=True)
         print(f"iteration {int(state.iteration):,}:\n{robustness.heading()}")
         found = robustness.measure(

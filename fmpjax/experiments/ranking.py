@@ -150,13 +150,19 @@ def table(ranking: dict[str, dict[str, float]]) -> str:
     return tables.lines("  {:<26} {:>7} {:>8}  {}", [headings, *rows])
 
 
+def _file(start: bool, last: bool, learned: bool) -> str:
+    if learned:
+        return f"ranking-learned{'-last' if last else ''}.json"
+    return "ranking-start.json" if start else "ranking.json"
+
+
 def main(
     run: Path,
     start: bool = False,
     last: bool = False,
     learned: bool = False,
     updates: int = 512,
-    out: Annotated[Path | None, default("RUN/ranking.json, ranking-start.json or ranking-learned.json")] = None,
+    out: Annotated[Path | None, default("in RUN: ranking.json, -start, -learned, -learned-last")] = None,
 ) -> None:
     """Rank the demonstration and spoiled copies of it under a fitted or a learned reward.
 
@@ -175,7 +181,7 @@ def main(
     opened = runs.Run.open(run)
     if not learned:
         priors.check_potential(opened.config.method)
-    path = out or opened.folder / f"ranking{'-start' if start else '-learned' if learned else ''}.json"
+    path = out or opened.folder / _file(start, last, learned)
     results.check_file(path)
     if start:
         trainer = opened.trainer()

@@ -18,7 +18,7 @@ from fmpjax.experiments.common.work import RUN, Measure
 
 DISTURBANCES = ("push", "delay", "friction", "together")  # of `fmpjax evaluate --robust`, each at two or three sizes
 EPISODES = 64  # of each size
-ROBUST, RANKING = "robustness-last.json", "ranking-learned.json"
+ROBUST, RANKING = "robustness-last.json", "ranking-learned-last.json"
 
 
 def of(cell: Cell, *, smoke: bool = False) -> Cell:
