@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fmpjax import features, rotations
+from fmpjax import features, kinematics, rotations
 from fmpjax.actions import ActionMap
 from fmpjax.config import Config, DisturbanceConfig
 from fmpjax.errors import UserError
@@ -20,6 +20,8 @@ from fmpjax.robots import Robot
 
 _NEVER = 1e8  # control steps to the next push where there is none
 _PUSH, _WAIT, _DELAY, _NOISE = 6, 1, 1, 5  # random numbers of a step; of the noise two per joint come on top
+_FLOORS = 2  # random numbers of uneven ground
+_CLEAR = 0.005  # m, by which a foot is above a floor that it does not touch
 
 
 class Sizes(NamedTuple):
@@ -30,6 +32,7 @@ class Sizes(NamedTuple):
     interval: jax.Array  # [N, 2] control steps between pushes
     speed: jax.Array  # [N, 2] m/s
     spin: jax.Array  # [N, 3] most of lift m/s, roll and pitch rad/s, turn rad/s
+    step: Any = ()  # [N, 1] m, highest step of uneven ground; nothing on even ground
 
 
 class Episode(NamedTuple):
@@ -40,12 +43,14 @@ class Episode(NamedTuple):
     wait: jax.Array  # [N] int32, control steps to the next push, that one included
     sent: jax.Array  # [N, D, J] earlier actions, newest last; zero before the first
     sensed: Any  # [N, H - 1, S] what the sensors said at earlier steps, oldest first; nothing without a history
+    floors: Any = ()  # [N, 2] m, heights of the floor under the two feet; nothing on even ground
+    ahead: Any = ()  # [N, 2] m, those of the next footsteps
 
 
 class State(NamedTuple):
     """Disturbances of N environments."""
 
-    body: Any  # Traits, drawn once; nothing where no robot differs
+    body: Any  # Traits but for the floors, drawn once; nothing where no robot differs
     bias: jax.Array  # [N, J] rad, of the encoders, drawn once
     sizes: Sizes
     share: jax.Array  # [N] of the pushes' size, the same for all; it may grow in training
@@ -71,6 +76,7 @@ class Disturbances:
         self.frictionloss = config.physics.frictionloss
         self.history, self.form = config.env.observation_history, features.observation_form(config)
         self.deployable = config.env.observation == "deployable"
+        self.uneven = bool(self.config.step_height)
         self.depth = max(1, -(-max(self.config.delay, default=0) // self.substeps))
         joints = robot.joint_count
         self.draws = _PUSH + _WAIT + _DELAY + (_NOISE + 2 * joints if self.config.noisy else 0)
@@ -86,14 +92,20 @@ class Disturbances:
         body_key, bias_key, begin_key = jax.random.split(key, 3)
         bias = config.encoder_bias * jax.random.uniform(bias_key, (count, joints), minval=-1.0)
         sizes = _sizes(config, self.rate, count)
+        if self.uneven:
+            sizes = sizes._replace(step=jnp.full((count, 1), config.step_height, jnp.float32))
         share = jnp.full(count, config.push_start, jnp.float32)
-        drawn = jax.random.uniform(begin_key, (count, self.draws))
+        drawn = self.draw(begin_key, (count,))
         body = _body(config, self.frictionloss, body_key, count, joints) if self.config.bodies else ()
         return State(body, bias, sizes, share, self.begin(sizes, drawn))
 
     def draw(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
         """Random numbers of steps, ``[*shape, K]`` in [0, 1)."""
-        return jax.random.uniform(key, (*shape, self.draws))
+        drawn = jax.random.uniform(key, (*shape, self.draws))
+        if not self.uneven:
+            return drawn
+        floors = jax.random.uniform(jax.random.fold_in(key, 1), (*shape, _FLOORS))
+        return jnp.concatenate([drawn, floors], axis=-1)
 
     def begin(self, sizes: Sizes, drawn: jax.Array) -> Episode:
         """Episodes that begin, with random numbers ``drawn [N, K]``. A push comes at any time of its first interval."""
@@ -107,6 +119,8 @@ class Disturbances:
             wait=1 + wait.astype(jnp.int32),
             sent=jnp.zeros((count, self.depth, joints)),
             sensed=jnp.zeros((count, self.history - 1, sum(self._widths))) if self.history > 1 else (),
+            floors=jnp.zeros((count, _FLOORS)) if self.uneven else (),
+            ahead=self._heights(sizes, drawn) if self.uneven else (),
         )
 
     def act(self, state: State, sim: PhysicsState, action: jax.Array, drawn: jax.Array) -> tuple[Any, State]:
@@ -125,7 +139,30 @@ class Disturbances:
         targets = self.actions(action)
         if self.config.encoder_bias:  # servos hold what the encoders say
             targets -= state.bias[:, None] if targets.ndim == 3 else state.bias
-        return (sim, targets, *((state.body,) if self.config.bodies else ())), state._replace(episode=episode)
+        if self.uneven:
+            episode = self._stepped(episode, sizes, sim, drawn)
+        state = state._replace(episode=episode)
+        if not self.config.bodies:
+            return (sim, targets), state
+        floors = episode.floors if self.uneven else jnp.zeros((len(targets), _FLOORS))
+        return (sim, targets, state.body._replace(floors=floors)), state
+
+    def _heights(self, sizes: Sizes, drawn: jax.Array) -> jax.Array:
+        """Heights of floors, ``[N, 2]`` m: up to half of the highest step above or below the level."""
+        return sizes.step * (drawn[:, -_FLOORS:] - 0.5)
+
+    def _stepped(self, episode: Episode, sizes: Sizes, sim: PhysicsState, drawn: jax.Array) -> Episode:
+        """The episodes with the floors on which the feet will land.
+
+        A foot in the air is above its next floor as soon as it is higher than both that and the one it left. If it is
+        never lifted so high, it comes down where it was. While it touches, what comes next is drawn again and again.
+        """
+        soles = kinematics.sole_heights(self.robot, kinematics.body_poses(self.robot, sim.qpos))
+        lowest = jnp.stack([soles[:, self.robot.sole_body == foot].min(-1) for foot in self.robot.feet], axis=-1)
+        above = lowest > jnp.maximum(episode.floors, episode.ahead) + _CLEAR
+        floors = jnp.where(above, episode.ahead, episode.floors)
+        touching = lowest < floors + _CLEAR
+        return episode._replace(floors=floors, ahead=jnp.where(touching, self._heights(sizes, drawn), episode.ahead))
 
     def push(self, state: State, drawn: jax.Array) -> jax.Array:
         """What a push of the next step adds to the root's velocity, ``[N, 6]``, zero where there is none."""
@@ -165,7 +202,8 @@ class Disturbances:
         body = state.body
         shown = [body.friction, body.torso_mass, body.torso_center, body.slope] if self.config.bodies else []
         late = [state.episode.delay[:, None].astype(sent.dtype)] if self.config.delay else []
-        return jnp.concatenate([sent.reshape(count, -1), *late, *shown], axis=-1)
+        floors = [state.episode.floors] if self.uneven else []
+        return jnp.concatenate([sent.reshape(count, -1), *late, *shown, *floors], axis=-1)
 
     def standing(self, state: State, qpos: jax.Array) -> State:
         """The disturbances with last actions that hold the joints where they are, as in the midst of an episode."""
@@ -182,7 +220,7 @@ class Disturbances:
 
     def _measured(self, state: State, sim: PhysicsState, drawn: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Positions and velocities with the errors of the sensors; root position and velocity are true."""
-        error = 2.0 * drawn[:, -_NOISE - 2 * self.robot.joint_count :] - 1.0
+        error = 2.0 * drawn[:, _PUSH + _WAIT + _DELAY : self.draws] - 1.0
         turn, tilt, angle, velocity = jnp.split(state.sizes.noise, 4, axis=-1)
         about = jnp.concatenate([tilt * error[:, 3:5], jnp.zeros_like(tilt)], axis=-1)
         rotation = rotations.multiply(sim.qpos[:, 3:7], rotations.exp_map(about))
@@ -239,7 +277,7 @@ def _body(config: DisturbanceConfig, frictionloss: float, key: jax.Array, count:
     armature = drawn(config.armature, joints, 1.0)
     steep, way = jnp.split(drawn((0.0, 1.0), 2, 0.0), 2, axis=-1)
     slope = config.slope * steep * jnp.concatenate([jnp.cos(2 * jnp.pi * way), jnp.sin(2 * jnp.pi * way)], axis=-1)
-    return Traits(friction, mass, off, stiffness, damping, strength, joint_friction, armature, slope)
+    return Traits(friction, mass, off, stiffness, damping, strength, joint_friction, armature, slope, ())
 
 
 def _push(sizes: Sizes, drawn: jax.Array) -> jax.Array:

@@ -19,6 +19,7 @@ from fmpjax import resources
 from fmpjax.errors import UserError
 
 _FEET = ("left_foot_", "right_foot_")  # what the names of sole points begin with
+FLOORS = ("left_floor", "right_floor")  # of the two feet, where the ground is uneven
 _LOOKS = 1  # geom group of what only the eye sees
 # m, how far a standing robot's soles are sunk into the floor. At 0 rounding decides which sole points touch; here all
 # bear, 0.9 of the G1's weight at once, and the pose neither drops nor is thrown. Resting soles settle at 0.6 mm.
@@ -72,11 +73,21 @@ class Robot:
     def joint_count(self) -> int:
         return len(self.joint_names)
 
-    def physics_model(self, *, numerics: Mapping[str, float] = {}, **options) -> mujoco.MjModel:  # noqa: B006
+    def physics_model(
+        self,
+        *,
+        numerics: Mapping[str, float] = {},  # noqa: B006
+        uneven: bool = False,
+        **options,
+    ) -> mujoco.MjModel:
         """The model without its looks, which cost time in every step, and with other solver options.
 
         Options are fields of ``model.opt``, e.g. ``timestep=0.01`` (s), and ``frictionloss`` (N m, every hinge).
-        ``numerics`` are custom numbers of the model, which MJX reads.
+        ``numerics`` are custom numbers of the model, which MJX reads. On ``uneven`` ground each foot has a floor of its
+        own, `FLOORS`, which nothing else touches.
+
+        Raises:
+          UserError: the ground is to be uneven, and the model's is not one plane.
         """
         spec = mujoco.MjSpec.from_file(str(self.path))
         for geom in [g for g in spec.geoms if g.group == _LOOKS]:
@@ -85,14 +96,52 @@ class Robot:
             geom.material = ""
         for look in (*spec.materials, *spec.textures):  # megabytes in each copy of the model
             spec.delete(look)
+        if uneven:
+            self._part_floor(spec)
         for name, value in numerics.items():
             spec.add_numeric(name=name, size=1, data=[value])
         model = spec.compile()
+        if uneven:  # the floors will not stay where MuJoCo's shortcut for the world's origin holds
+            model.geom_sameframe[[model.geom(name).id for name in FLOORS]] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         if "frictionloss" in options:
             model.dof_frictionloss[6:] = options.pop("frictionloss")
         for key, value in options.items():
             setattr(model.opt, key, value)
         return model
+
+    def _part_floor(self, spec: mujoco.MjSpec) -> None:
+        """Give each foot a floor of its own, at the height of the model's, which it then no longer touches."""
+        ground = spec.worldbody.geoms
+        if len(ground) != 1 or ground[0].type != mujoco.mjtGeom.mjGEOM_PLANE:
+            raise UserError(
+                f"robot {self.name}: expected one plane in the world, its floor, where the ground is uneven"
+            )
+        floor, used = ground[0], 0
+        for geom in spec.geoms:
+            used |= geom.contype | geom.conaffinity
+        free = [1 << bit for bit in range(31) if not used >> bit & 1]
+        if len(free) < 3:
+            raise UserError(f"robot {self.name}: expected three bits that no contype or conaffinity uses")
+        for geom in spec.geoms:
+            if geom.contype & floor.conaffinity or geom.conaffinity & floor.contype:
+                geom.contype |= free[next((i for i, foot in enumerate(_FEET) if geom.name.startswith(foot)), 2)]
+        floor.contype, floor.conaffinity = 0, free[2]
+        for name, bit in zip(FLOORS, free, strict=False):
+            own = spec.worldbody.add_geom(name=name, contype=0, conaffinity=bit, density=0)
+            for alike in (
+                "type",
+                "size",
+                "pos",
+                "quat",
+                "condim",
+                "friction",
+                "solref",
+                "solimp",
+                "solmix",
+                "priority",
+            ):
+                setattr(own, alike, getattr(floor, alike))
+            own.margin, own.gap = floor.margin, floor.gap
 
     def takes(self, other: str) -> bool:
         """Whether motions of the robot named ``other`` are this one's, too: both have the same joints in one order."""

@@ -101,6 +101,7 @@ def cases(config: Config) -> list[Case]:
             (f"{x:g} x mjlab", {name: x * most for name, most in NOISE.items()}) for x in (0.5, 1, 2)
         ],
         "slope": [(f"to {v:g} rad", {"slope": v}) for v in (0.03, 0.06, 0.12)],
+        "steps": [(f"to {1e3 * v:g} mm", {"step_height": v}) for v in (0.02, 0.04, 0.08)],
     }
     every: dict[str, Any] = {"push_interval": (EVERY, EVERY)}
     found = [Case("none", "", DisturbanceConfig())]
@@ -158,11 +159,15 @@ class Player:
         config = trainer.config
         # Every disturbance is on; their sizes are in the state.
         everything = dataclasses.replace(
-            MJLAB, torso_mass=(0.0, 0.0), joint_friction=(0.0, 0.0), delay=(0, 2 * config.physics.substeps)
+            MJLAB,
+            torso_mass=(0.0, 0.0),
+            joint_friction=(0.0, 0.0),
+            delay=(0, 2 * config.physics.substeps),
+            step_height=0.01,
         )
         settings = dataclasses.replace(config.physics, backend="native")  # MJX does not have all of them
         everything = dataclasses.replace(config, disturbance=everything, physics=settings)
-        backend = physics.make(trainer.robot, settings, joint_friction=True)
+        backend = physics.make(trainer.robot, settings, joint_friction=True, uneven=True)
         self.env = Env(trainer.robot, trainer.library, everything, backend)
         assert self.env.disturbances is not None, "the evaluation's own configuration has every disturbance"
         self.disturbances = self.env.disturbances
@@ -239,7 +244,8 @@ def measure(
       note: called with a line after each case; None for silence.
 
     Raises:
-      UserError: the robot has no torso whose mass could differ, or no case has a disturbance of that name.
+      UserError: the robot has no torso whose mass could differ, or stands on more than a plane, or no case has a
+        disturbance of that name.
     """
     wanted = chosen(trainer.config, disturbances)
     player, cells = Player(trainer, episodes), []

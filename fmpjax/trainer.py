@@ -44,7 +44,12 @@ class Trainer:
         self.robot = robots.load(config.robot)
         for clip in self.library.clips:
             _check(clip, self.robot, config)
-        backend = physics.make(self.robot, config.physics, joint_friction=bool(config.disturbance.joint_friction))
+        backend = physics.make(
+            self.robot,
+            config.physics,
+            joint_friction=bool(config.disturbance.joint_friction),
+            uneven=bool(config.disturbance.step_height),
+        )
         self.env = Env(self.robot, self.library, config, backend)
         clock = config.env.longest_episode if priors.remembers(config.method) else 0
         form = features.observation_form(config)

@@ -63,8 +63,8 @@ def tiny(**changes):
 
 
 def disturbed(**changes):
-    """The smallest run with all disturbances of the preset `robot`, more often pushed, that obeys commands."""
-    own = dataclasses.asdict(preset("robot").disturbance) | {"push_interval": (0.04, 0.1)}
+    """The smallest run with all disturbances of the preset `robot`, more often pushed, on uneven ground, that obeys."""
+    own = dataclasses.asdict(preset("robot").disturbance) | {"push_interval": (0.04, 0.1), "step_height": 0.02}
     own = {f"disturbance.{name}": value for name, value in own.items()}
     own |= {"env.observation": "deployable", "env.observation_history": 2, "env.first_cap": 5}
     own |= {"command.kind": "velocity", "env.axes": "heading", "features.axes": "heading"}
@@ -95,7 +95,8 @@ def nominal_traits(robot, count):
     joints = robot.joint_count
     ones, none = jnp.ones((count, joints)), jnp.zeros((count, joints))
     one, zero = jnp.ones((count, 1)), jnp.zeros((count, 1))
-    return Traits(one, zero, jnp.zeros((count, 3)), ones, ones, ones, none, ones, jnp.zeros((count, 2)))
+    even = jnp.zeros((count, 2))
+    return Traits(one, zero, jnp.zeros((count, 3)), ones, ones, ones, none, ones, even, even)
 
 
 def other_traits(robot, count):
@@ -103,8 +104,9 @@ def other_traits(robot, count):
     rng = np.random.default_rng(0)
     shapes = traits.widths(robot.joint_count)
     spans = Traits(
-        (0.3, 1.2), (-1, 3), (-0.05, 0.05), (0.8, 1.2), (0.8, 1.2), (0.7, 1), (0.1, 0.2), (1, 1.5), (-0.1, 0.1)
-    )
+        (0.3, 1.2), (-1, 3), (-0.05, 0.05), (0.8, 1.2), (0.8, 1.2), (0.7, 1), (0.1, 0.2), (1, 1.5), (-0.1, 0.1),
+        (-0.01, 0.01),
+    )  # fmt: skip
     return Traits(*(jnp.asarray(rng.uniform(*s, (count, w)), jnp.float32) for s, w in zip(spans, shapes, strict=True)))
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fmpjax import disturbances, features, motion, physics, robots, rotations
+from fmpjax import disturbances, features, kinematics, motion, physics, robots, rotations
 from fmpjax.acting import ActionRule, Seen
 from fmpjax.actions import action_map
 from fmpjax.config import DisturbanceConfig, preset
@@ -48,6 +48,7 @@ def test_presets_without_disturbances_have_none(robot, walk):
         ("damping", "-0.1,1", "damping is -0.1, 1: expected numbers of at least 0"),
         ("torso_center", "0.1", "torso_center is 0.1: expected three numbers, along x, y and z, or none"),
         ("slope", "0.6", "slope is 0.6: expected at most 0.5 rad"),
+        ("step_height", "0.3", "step_height is 0.3: expected at most 0.2 m"),
         ("delay", "4,0", "delay is 4, 0: expected two numbers, the lower one first, or none"),
         ("push_interval", "0,1", "push_interval is 0, 1: expected numbers above 0"),
     ],
@@ -177,6 +178,47 @@ def test_pushes_grow_while_episodes_survive(robot, walk):
     for _ in range(9):
         state = made.grow(state, jnp.float32(0.9), 0.75)
     np.testing.assert_array_equal(state.share, 1.0)
+
+
+# --- uneven ground ---------------------------------------------------------------------------------------------------
+
+
+def test_a_foot_that_is_lifted_comes_down_on_another_floor(robot, walk):
+    made = built(robot, walk, **{"disturbance.step_height": 0.04})
+    state, level = made.init(jax.random.PRNGKey(0), COUNT), states(robot)
+    ahead = np.asarray(state.episode.ahead)
+    assert not np.asarray(state.episode.floors).any() and np.abs(ahead).max() == pytest.approx(0.02, rel=0.01)
+    standing = np.tile(robot.default_qpos, (COUNT, 1)).astype(np.float32)
+    lifted = standing.copy()
+    lifted[:, 2] += 0.5
+    action = jnp.zeros((COUNT, robot.joint_count))
+
+    def step(state, qpos, key):
+        sim, drawn = level._replace(qpos=jnp.asarray(qpos)), made.draw(jax.random.PRNGKey(key), (COUNT,))
+        (_, _, body), state = made.act(state, sim, action, drawn)
+        np.testing.assert_array_equal(body.floors, state.episode.floors)
+        return state
+
+    # Feet that touch stay where they are, and what comes next is drawn again.
+    still = step(state, standing, 1)
+    assert not np.asarray(still.episode.floors).any() and (np.asarray(still.episode.ahead) != ahead).all()
+    # In the air both feet are above their next floors, which then stay those.
+    flown = step(still, lifted, 2)
+    np.testing.assert_array_equal(flown.episode.floors, still.episode.ahead)
+    again = step(flown, lifted, 3)
+    np.testing.assert_array_equal(again.episode.floors, flown.episode.floors)
+    # A foot that is lifted by 10 mm does not reach a floor that is higher.
+    low = standing.copy()
+    low[:, 2] += 0.01
+    reached = np.asarray(step(still, low, 4).episode.floors)
+    soles = kinematics.sole_heights(robot, kinematics.body_poses(robot, jnp.asarray(low[:1])))
+    height = float(soles.min())
+    assert 0.008 < height < 0.01  # the default pose is sunk by 1 mm
+    expected = np.where(np.asarray(still.episode.ahead) + 0.005 < height, still.episode.ahead, 0.0)
+    np.testing.assert_array_equal(reached, expected)
+    assert 0.2 < (reached == 0).mean() < 0.5
+    # An episode that begins again begins on level ground.
+    assert not np.asarray(made.begin(state.sizes, made.draw(jax.random.PRNGKey(5), (COUNT,))).floors).any()
 
 
 # --- late actions ----------------------------------------------------------------------------------------------------
@@ -309,7 +351,7 @@ def test_a_history_holds_each_terms_steps_oldest_first(robot, walk):
 def played():
     """Two rollouts of the `robot` preset's disturbances, faster than usual, and the environment before and after."""
     config, one = disturbed(), robots.load("unitree_g1")
-    env = Env(one, motion.load("walk"), config, physics.make(one, config.physics))
+    env = Env(one, motion.load("walk"), config, physics.make(one, config.physics, uneven=True))
     joints = one.joint_count
 
     def act(observation, key):
@@ -327,8 +369,8 @@ def test_the_actor_sees_sensors_and_the_critic_the_truth(played):
     assert isinstance(first.observation, Seen)
     sizes = env.observation_size
     assert sizes.actor == first.observation.actor.shape[-1] == 2 * 96
-    # Compact observation, command, its errors, two actions on their way, their delay, robot and floor.
-    assert sizes.critic == first.observation.critic.shape[-1] == 86 + 3 + 3 + 2 * 29 + 1 + 7
+    # Compact observation, command, its errors, two actions on their way, their delay, robot and floor, uneven ground.
+    assert sizes.critic == first.observation.critic.shape[-1] == 86 + 3 + 3 + 2 * 29 + 1 + 7 + 2
     assert first.next_observation.shape[-1] == sizes.critic
     np.testing.assert_array_equal(first.extras["saw"], first.observation.actor)
     clip = env.clip_observations

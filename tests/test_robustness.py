@@ -26,7 +26,7 @@ def test_each_disturbance_is_alone_at_three_sizes_and_all_are_together():
     names = [case.disturbance for case in found]
     assert names[0] == "none" and found[0].config == DisturbanceConfig() and names[-2:] == ["together"] * 2
     alone = set(names) - {"none", "together"}
-    assert all(names.count(name) == 3 for name in alone) and len(alone) == 13
+    assert all(names.count(name) == 3 for name in alone) and len(alone) == 14
     delays = [case for case in found if case.disturbance == "delay"]
     assert [case.size for case in delays] == ["10 ms", "20 ms", "40 ms"]
     assert [case.config.delay for case in delays] == [(1, 1), (2, 2), (4, 4)]

@@ -10,6 +10,7 @@ from fmpjax.errors import UserError
 
 Ends = tuple[float, ...]  # of a range, the lower one first; empty for none
 _STEEPEST = 0.5  # rad, beyond which a floor is no floor
+_HIGHEST = 0.2  # m, beyond which a step is a stair
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +37,11 @@ class DisturbanceConfig(Section):
     # physics steps, shortest and longest delay of the actions [D]; 0 to physics.substeps [H]
     delay: Annotated[tuple[NonNegativeInt, ...], Meta(max_length=2)] = ()
 
+    # Of each footstep.
+
+    # m, highest step from one foot's floor to the other's, both of which are drawn anew [D]
+    step_height: NonNegativeFloat = 0.0
+
     # Of each control step.
 
     turn_noise: NonNegativeFloat = 0.0  # rad/s, largest error of the observed angular velocity [D]; 0.2 [J]
@@ -56,7 +62,7 @@ class DisturbanceConfig(Section):
     def bodies(self) -> bool:
         """Whether the robot or its floor differs from one environment to the next."""
         ranges = (self.friction, self.torso_mass, self.torso_center, self.stiffness, self.damping, self.strength)
-        return any((*ranges, self.joint_friction, self.armature, self.slope))
+        return any((*ranges, self.joint_friction, self.armature, self.slope, self.step_height))
 
     @property
     def noisy(self) -> bool:
@@ -85,6 +91,8 @@ class DisturbanceConfig(Section):
             raise UserError(f"{self._said('torso_center')}: expected three numbers, along x, y and z, or none")
         if self.slope > _STEEPEST:
             raise UserError(f"setting disturbance.slope is {self.slope:g}: expected at most {_STEEPEST:g} rad")
+        if self.step_height > _HIGHEST:
+            raise UserError(f"setting disturbance.step_height is {self.step_height:g}: expected at most {_HIGHEST:g} m")
         if self.push_interval and not self.push_speed:
             raise UserError("setting disturbance.push_speed is empty and push_interval is not: expected two numbers")
 

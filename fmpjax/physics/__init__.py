@@ -9,13 +9,14 @@ from fmpjax.physics.traits import Traits
 from fmpjax.robots import Robot
 
 
-def make(robot: Robot, config: PhysicsConfig, *, joint_friction: bool = False) -> Physics:
+def make(robot: Robot, config: PhysicsConfig, *, joint_friction: bool = False, uneven: bool = False) -> Physics:
     """The backend that the configuration names; ``auto`` is MJX where JAX sees an accelerator, else MuJoCo C.
 
-    With ``joint_friction`` traits may give the joints dry friction where the model has none.
+    With ``joint_friction`` traits may give the joints dry friction where the model has none; on ``uneven`` ground the
+    floors of the feet have heights, which traits say.
 
     Raises:
-      UserError: joint friction is asked of MJX.
+      UserError: joint friction is asked of MJX in JAX.
     """
     backend = config.backend
     if backend == "auto":
@@ -24,12 +25,15 @@ def make(robot: Robot, config: PhysicsConfig, *, joint_friction: bool = False) -
     if backend == "mjx":
         from fmpjax.physics.mjx import MjxPhysics
 
-        if joint_friction:  # with it MJX was seen to leave MuJoCo C by a tenth of a radian in one control step
-            raise UserError("disturbance.joint_friction needs physics.backend=native: MJX gives other results")
-        return MjxPhysics(robot, config)
+        if joint_friction and config.impl == "jax":  # it was seen to leave MuJoCo C by 0.1 rad in one control step
+            raise UserError(
+                "disturbance.joint_friction needs physics.backend=native or physics.impl=warp: MJX in JAX gives other "
+                "results"
+            )
+        return MjxPhysics(robot, config, uneven=uneven)
     from fmpjax.physics.native import NativePhysics
 
-    return NativePhysics(robot, config)
+    return NativePhysics(robot, config, uneven=uneven)
 
 
 __all__ = ["Physics", "PhysicsState", "Traits", "make", "reset"]

@@ -6,6 +6,7 @@ from typing import NoReturn
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from fmpjax import machine
 from fmpjax.config import PhysicsConfig
@@ -25,13 +26,13 @@ class MjxPhysics:
 
     name = "mjx"
 
-    def __init__(self, robot: Robot, config: PhysicsConfig):
+    def __init__(self, robot: Robot, config: PhysicsConfig, *, uneven: bool = False):
         self.robot, self.config = robot, config
         limits = {}
         if robot.self_collision and config.impl == "jax":
             # MJX in JAX works on every pair of geoms at every step: of a pair of shapes' kinds the nearest are kept.
             limits = {"max_geom_pairs": config.max_contacts, "max_contact_points": config.max_contacts}
-        self.model = native.model(robot, config, **limits)
+        self.model = native.model(robot, config, uneven=uneven, **limits)
         self._device = jax.local_devices()[0]  # of several processes each has its own
         self._overflow = 0  # bits of Warp's word on worlds that lost contacts or constraints to a full buffer
         if config.impl == "warp":
@@ -84,8 +85,6 @@ class MjxPhysics:
         targets = jnp.asarray(targets, state.qpos.dtype).reshape(len(targets), -1)
         if traits is None:
             return PhysicsState(*self._step(*state, targets))
-        if self.config.impl == "warp":
-            _refuse("all robots share one model: expected physics.impl 'jax' for disturbances of robot or floor")
         return PhysicsState(*self._step(*state, targets, traits.packed.astype(state.qpos.dtype)))
 
     @functools.cached_property
@@ -96,17 +95,19 @@ class MjxPhysics:
         template = self._data(len(arguments[0]))
 
         def one(qpos, qvel, warmstart, targets, *traits):
-            model = self._model
+            model, data = self._model, template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
             if traits:
                 fields = changed(self._nominal, unpacked(traits[0]), jnp)
                 model = model.tree_replace({name: jnp.asarray(x, qpos.dtype) for name, x in fields.items()})
+                if self._nominal.uneven:  # Warp places what is fixed to the world once, when it makes the data
+                    floor = np.any(self._nominal.floors, axis=1, keepdims=True)
+                    data = data.replace(geom_xpos=jnp.where(floor, model.geom_pos, data.geom_xpos))
 
             def step(data, targets):
                 data = data.replace(ctrl=targets)
                 own = _saturated(model, data) if self.config.impl == "jax" else model
                 return mjx.step(own, data), None
 
-            data = template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
             # Targets of one control step are held; those of each physics step are as many already.
             several = jnp.broadcast_to(targets.reshape(-1, self.model.nu), (self.config.substeps, self.model.nu))
             data, _ = jax.lax.scan(step, data, several)

@@ -21,7 +21,7 @@ from fmpjax.config import PhysicsConfig
 from fmpjax.physics import ffi
 from fmpjax.physics.base import PhysicsState
 from fmpjax.physics.traits import Nominal, Traits, changed, unpacked
-from fmpjax.robots import Robot
+from fmpjax.robots import FLOORS, Robot
 
 # The backend that serves a name; XLA keeps its address for good, so those of the same name share its threads.
 _FIRST: dict[str, "NativePhysics"] = {}
@@ -34,8 +34,10 @@ class NativePhysics:
 
     name = "native"
 
-    def __init__(self, robot: Robot, config: PhysicsConfig):
-        self.robot, self.model = robot, _without_warmstart(model(robot, config))
+    def __init__(self, robot: Robot, config: PhysicsConfig, *, uneven: bool = False):
+        self.robot, self.model = robot, _without_warmstart(model(robot, config, uneven=uneven))
+        if uneven:  # MuJoCo's tree of boxes has the floors where they were compiled
+            self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
         self.substeps = config.substeps
         self.threads = config.threads or machine.cores()
         # All that a step depends on is in the name, by which a program that was kept finds it.
@@ -49,7 +51,7 @@ class NativePhysics:
         self._pool = mujoco.rollout.Rollout(nthread=self.threads)
         self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
         self._turn = threading.Lock()  # several devices call back at once; the threads serve one after another
-        self._models: dict[bytes, mujoco.MjModel] = {}  # by their traits
+        self._models: dict[tuple[int, bytes], mujoco.MjModel] = {}  # by their traits
         ffi.register(self._function, self._advance)
 
     def step(self, state: PhysicsState, targets: jax.Array, traits: Traits | None = None) -> PhysicsState:
@@ -103,14 +105,21 @@ class NativePhysics:
         reached[:] = states[:, -1, 1:]
 
     def _with_traits(self, rows: np.ndarray) -> list[mujoco.MjModel]:
-        """A model for each row of traits; models are kept, since a robot's traits stay for a whole run."""
-        keys = [row.tobytes() for row in rows]
+        """A model for each row of traits; models are kept, since all traits but the floors stay for a whole run."""
+        uneven = self._nominal.uneven
+        # Where floors change, each row has a model of its own, in which they are set again for each step.
+        keys = [(i if uneven else 0, row[: -len(FLOORS)].tobytes()) for i, row in enumerate(rows)]
         if len(self._models) > max(_KEPT, 2 * len(rows)):
             self._models.clear()
         for key, row in zip(keys, rows, strict=True):
             if key not in self._models:
                 self._models[key] = self._model_of(unpacked(row.astype(np.float64)))
-        return [self._models[key] for key in keys]
+        models = [self._models[key] for key in keys]
+        if uneven:
+            heights = self._nominal.fields["geom_pos"][:, 2] + rows[:, -len(FLOORS) :] @ self._nominal.floors.T
+            for built, height in zip(models, heights, strict=True):
+                built.geom_pos[:, 2] = height
+        return models
 
     def _model_of(self, traits: Traits) -> mujoco.MjModel:
         built = copy.copy(self.model)
@@ -143,10 +152,11 @@ def _without_warmstart(built: mujoco.MjModel) -> mujoco.MjModel:
     return built
 
 
-def model(robot: Robot, config: PhysicsConfig, **numerics: float) -> mujoco.MjModel:
+def model(robot: Robot, config: PhysicsConfig, *, uneven: bool = False, **numerics: float) -> mujoco.MjModel:
     """The robot's model with the run's solver options, and custom numbers that a backend reads."""
     built = robot.physics_model(
         numerics=numerics,
+        uneven=uneven,
         timestep=config.timestep,
         iterations=config.iterations,
         ls_iterations=config.ls_iterations,

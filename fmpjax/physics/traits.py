@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from fmpjax.errors import UserError
-from fmpjax.robots import Robot
+from fmpjax.robots import FLOORS, Robot
 
 
 class Traits(NamedTuple):
@@ -24,6 +24,8 @@ class Traits(NamedTuple):
     joint_friction: jax.Array  # [N, J] N m, dry friction
     armature: jax.Array  # [N, J] factor of the motors' inertia
     slope: jax.Array  # [N, 2] rad, by which the floor rises along x and y: gravity is tilted, the floor is not
+    # [N, 2] m, heights of the floor under the left and the right foot: last, as they alone change in an episode
+    floors: Any
 
     @property
     def packed(self) -> jax.Array:
@@ -33,7 +35,7 @@ class Traits(NamedTuple):
 
 def widths(joints: int) -> tuple[int, ...]:
     """Numbers of each trait of one robot, in the order of `Traits`."""
-    return (1, 1, 3, joints, joints, joints, joints, joints, 2)
+    return (1, 1, 3, joints, joints, joints, joints, joints, 2, len(FLOORS))
 
 
 def unpacked(row: Any) -> Traits:
@@ -58,6 +60,7 @@ class Nominal:
     torso: np.ndarray  # [bodies] 1 for the torso
     carries: np.ndarray  # [bodies] 1 for the torso and every body that it hangs from
     gravity: float  # m/s²
+    floors: np.ndarray  # [geoms, 2] 1 for the floor of the left and of the right foot; none on even ground
 
     @classmethod
     def of(cls, robot: Robot, model: mujoco.MjModel) -> "Nominal":
@@ -73,8 +76,8 @@ class Nominal:
             carries[body] = 1.0
             body = model.body_parentid[body]
         names = (
-            "geom_friction body_mass body_subtreemass body_inertia body_ipos actuator_gainprm actuator_biasprm "
-            "actuator_forcerange jnt_actfrcrange dof_frictionloss dof_armature"
+            "geom_pos geom_friction body_mass body_subtreemass body_inertia body_ipos actuator_gainprm "
+            "actuator_biasprm actuator_forcerange jnt_actfrcrange dof_frictionloss dof_armature"
         )
         return cls(
             fields={name: getattr(model, name).copy() for name in names.split()},
@@ -82,7 +85,13 @@ class Nominal:
             torso=np.arange(model.nbody) == torso,
             carries=carries,
             gravity=float(np.linalg.norm(model.opt.gravity)),
+            floors=np.array([[geom.name == name for name in FLOORS] for geom in geoms], float),
         )
+
+    @property
+    def uneven(self) -> bool:
+        """Whether the feet have floors of their own."""
+        return bool(self.floors.any())
 
 
 def torso_body(robot: Robot) -> int:
@@ -113,7 +122,11 @@ def changed(nominal: Nominal, traits: Traits, xp: Any = np) -> dict[str, Any]:
     bias = bias * xp.where(np.arange(10) == 2, traits.damping[:, None], 1.0)
     joint_limits = xp.concatenate([np.ones(1), traits.strength])[:, None]
     sliding = nominal.ground[:, None] & (np.arange(3) == 0)
-    return {
+    raised = {}
+    if nominal.uneven:
+        height = xp.asarray(nominal.floors, traits.floors.dtype) @ traits.floors
+        raised["geom_pos"] = own["geom_pos"] + height[:, None] * (np.arange(3) == 2)
+    return raised | {
         "geom_friction": own["geom_friction"] * xp.where(sliding, traits.friction[0], 1.0),
         "body_mass": own["body_mass"] + torso * mass,
         "body_subtreemass": own["body_subtreemass"] + nominal.carries * mass,

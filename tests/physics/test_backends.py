@@ -202,7 +202,7 @@ def test_mjx_steps_like_native(robot, states):
     several = np.stack([targets, targets + 0.1], axis=1)  # of each physics step, as delays make them
     config = dataclasses.replace(LAPTOP, iterations=10, ls_iterations=20)
     mjx = dataclasses.replace(config, backend="mjx", impl="jax")
-    ours, theirs = (advance(physics.make(robot, c), qpos, qvel, several, 3, traits) for c in (config, mjx))
+    ours, theirs = (advance(physics.make(robot, c, uneven=True), qpos, qvel, several, 3, traits) for c in (config, mjx))
     gaps = {}
     kinds = {"standing": slice(0, 2), "in the air": slice(2, 4), "walking": slice(4, 8), "other robots": slice(8, None)}
     for name, rows in kinds.items():
@@ -251,12 +251,19 @@ def warp():
 
 @pytest.mark.slow
 def test_warp_steps_like_native(robot, states, warp):
-    """The same states and targets as MJX in JAX gets, three control steps."""
-    ours = advance(physics.make(robot, PAPER), *states, 3)
-    theirs = advance(physics.make(robot, warp), *states, 3)
-    position, velocity = (np.abs(a - b).max(axis=(1, 2)) for a, b in zip(ours[:2], theirs[:2], strict=True))
-    print(f"native and Warp: qpos {position} m or rad, qvel {velocity} m/s or rad/s after each step")
-    assert position.max() < 1e-4 and velocity.max() < 1e-2
+    """The same states and targets as MJX in JAX gets, three control steps: robots of the model, and all others."""
+    qpos, qvel, targets = states
+    several = np.stack([targets, targets, targets + 0.1, targets + 0.1], axis=1)  # of each physics step
+    traits = other_traits(robot, len(qpos))
+    cases = {"the model": ({}, (targets,)), "others": ({"joint_friction": True, "uneven": True}, (several, traits))}
+    for said, (options, arguments) in cases.items():
+        ours, theirs = (
+            advance(physics.make(robot, config, **options), qpos, qvel, arguments[0], 3, *arguments[1:])
+            for config in (PAPER, warp)
+        )
+        position, velocity = (np.abs(a - b).max(axis=(1, 2)) for a, b in zip(ours[:2], theirs[:2], strict=True))
+        print(f"native and Warp, {said}: qpos {position} m or rad, qvel {velocity} m/s or rad/s after each step")
+        assert position.max() < 1e-4 and velocity.max() < 1e-2, said
 
 
 @pytest.mark.slow

@@ -32,9 +32,11 @@ def states(walk):
 
 def by_hand(robot, config, state, targets, own: Traits):
     """One control step by MuJoCo's own loop, under ``targets [S, J]`` of each physics step, of a model changed here."""
-    model = copy.copy(physics.make(robot, config).model)
+    model = copy.copy(physics.make(robot, config, uneven=bool(np.any(own.floors))).model)
+    if np.any(own.floors):
+        model.geom("left_floor").pos[2], model.geom("right_floor").pos[2] = own.floors
     torso = model.body("torso_link").id
-    floor = [i for i in range(model.ngeom) if model.geom(i).name == "floor" or "_foot_" in model.geom(i).name]
+    floor = [i for i in range(model.ngeom) if any(part in model.geom(i).name for part in ("floor", "_foot_"))]
     assert len(floor) > 2
     model.geom_friction[floor, 0] *= float(own.friction[0])
     mass = model.body_mass[torso]
@@ -62,7 +64,7 @@ def by_hand(robot, config, state, targets, own: Traits):
 @pytest.mark.parametrize("name", [*Traits._fields, "all"])
 def test_a_trait_is_what_mujoco_makes_of_a_changed_model(robot, states, name):
     qpos, qvel, targets = states
-    backend = physics.make(robot, LAPTOP)
+    backend = physics.make(robot, LAPTOP, uneven=name in ("floors", "all"))
     plain = nominal_traits(robot, COUNT)
     own = (
         other_traits(robot, COUNT)
@@ -90,6 +92,58 @@ def test_the_models_own_traits_change_no_bit(robot, states):
             np.testing.assert_array_equal(a, b)
 
 
+def test_level_floors_of_the_feet_are_one_floor(robot, states):
+    qpos, qvel, targets = states
+    start, own = physics.reset(qpos, qvel), nominal_traits(robot, COUNT)
+    even, parted = (jax.jit(physics.make(robot, LAPTOP, uneven=uneven).step) for uneven in (False, True))
+    for a, b in zip(even(start, targets, own), parted(start, targets, own), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+
+
+def test_floors_change_from_step_to_step(robot, states):
+    """Models are kept, and no height of an earlier step stays in them."""
+    qpos, qvel, targets = states
+    backend, start = physics.make(robot, LAPTOP, uneven=True), physics.reset(qpos, qvel)
+    step, own = jax.jit(backend.step), nominal_traits(robot, COUNT)
+    level = step(start, targets, own)
+    raised = step(start, targets, own._replace(floors=jnp.full((COUNT, 2), 0.02)))
+    assert np.abs(np.asarray(raised.qvel - level.qvel)).max() > 0.1
+    for a, b in zip(level, step(start, targets, own), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_raised_floor_bears_a_robot_above_the_level(robot):
+    """MuJoCo's tree of boxes ends at the level of the floor that was compiled, and would let the feet through."""
+    backend, own = physics.make(robot, LAPTOP, uneven=True), nominal_traits(robot, 2)
+    qpos = np.tile(robot.default_qpos, (2, 1))
+    qpos[:, 2] += 0.01
+    start = physics.reset(jnp.asarray(qpos, jnp.float32), jnp.zeros((2, robot.joint_count + 6)))
+    targets = jnp.asarray(qpos[:, 7:], jnp.float32)
+    fell = jax.jit(backend.step)(start, targets, own._replace(floors=jnp.array([[0.0, 0.0], [0.012, 0.012]]))).qvel[
+        :, 2
+    ]
+    assert fell[0] < -0.15 and fell[1] > -0.1
+
+
+@pytest.mark.parametrize("name", ["unitree_g1", "unitree_g1_29dof", "strider"])
+def test_each_foot_has_a_floor_of_its_own(name):
+    """What collides stays the same but for the feet, each of which leaves the common floor for its own."""
+
+    def colliding(model):
+        kinds, takes = model.geom_contype, model.geom_conaffinity
+        pairs = np.argwhere(np.triu((kinds[:, None] & takes | kinds & takes[:, None]) != 0, 1))
+        return {frozenset(model.geom(i).name for i in pair) for pair in pairs}
+
+    robot = robots.load(name)
+    even, parted = colliding(robot.physics_model()), colliding(robot.physics_model(uneven=True))
+
+    def other(pair):
+        sole = next((geom for geom in pair if "_foot_" in geom), "")
+        return pair - {"floor"} | {sole.partition("_")[0] + "_floor"} if sole and "floor" in pair else pair
+
+    assert {other(pair) for pair in even} == parted and even != parted
+
+
 def test_targets_of_each_physics_step(robot, states):
     qpos, qvel, targets = states
     backend = physics.make(robot, LAPTOP)
@@ -113,7 +167,7 @@ def test_traits_of_batches_of_batches(robot, states):
 
 
 def test_joint_friction_is_refused_by_mjx(robot):
-    with pytest.raises(UserError, match="disturbance.joint_friction needs physics.backend=native"):
+    with pytest.raises(UserError, match="joint_friction needs physics.backend=native or physics.impl=warp"):
         physics.make(robot, dataclasses.replace(LAPTOP, backend="mjx"), joint_friction=True)
 
 
