@@ -19,6 +19,7 @@ from fmpjax import commands, disturbances, features, offenders, physics, shardin
 from fmpjax.acting import ActionRule, Seen, of_actor
 from fmpjax.actions import ActionMap, action_map
 from fmpjax.config import Config, DisturbanceConfig
+from fmpjax.errors import UserError
 from fmpjax.features import Observed
 from fmpjax.motion import MotionClip, MotionLibrary
 from fmpjax.motion.clip import refined
@@ -138,6 +139,11 @@ class Env:
         self.command = commands.make(config, robot, library, self._table.frame)
         told = jax.eval_shape(lambda: self._told(self.first_command(jnp.arange(1))))
         self.disturbances = disturbances.make(config, robot, self.actions, told.shape[-1] if self.command else 0)
+        if config.disturbance.step_height and not getattr(backend, "uneven", False):
+            raise UserError(
+                f"setting disturbance.step_height is {config.disturbance.step_height:g} and the physics has even "
+                "ground: expected physics that was made with uneven=True"
+            )
 
     @property
     def observation_size(self) -> Any:

@@ -87,7 +87,8 @@ class Robot:
         own, `FLOORS`, which nothing else touches.
 
         Raises:
-          UserError: the ground is to be uneven, and the model's is not one plane.
+          UserError: the ground is to be uneven, and the model's world is not one plane, or its bits for collisions are
+            used up.
         """
         spec = mujoco.MjSpec.from_file(str(self.path))
         for geom in [g for g in spec.geoms if g.group == _LOOKS]:
@@ -113,35 +114,27 @@ class Robot:
         """Give each foot a floor of its own, at the height of the model's, which it then no longer touches."""
         ground = spec.worldbody.geoms
         if len(ground) != 1 or ground[0].type != mujoco.mjtGeom.mjGEOM_PLANE:
+            found = " and ".join(geom.name or "a geom without a name" for geom in ground) or "nothing"
             raise UserError(
-                f"robot {self.name}: expected one plane in the world, its floor, where the ground is uneven"
+                f"disturbance.step_height needs a world of one plane, the floor: that of robot {self.name} has {found}"
             )
         floor, used = ground[0], 0
         for geom in spec.geoms:
             used |= geom.contype | geom.conaffinity
         free = [1 << bit for bit in range(31) if not used >> bit & 1]
         if len(free) < 3:
-            raise UserError(f"robot {self.name}: expected three bits that no contype or conaffinity uses")
+            raise UserError(
+                f"disturbance.step_height needs three bits that no contype or conaffinity of robot {self.name} uses: "
+                f"found {len(free)}"
+            )
         for geom in spec.geoms:
             if geom.contype & floor.conaffinity or geom.conaffinity & floor.contype:
                 geom.contype |= free[next((i for i, foot in enumerate(_FEET) if geom.name.startswith(foot)), 2)]
         floor.contype, floor.conaffinity = 0, free[2]
         for name, bit in zip(FLOORS, free, strict=False):
             own = spec.worldbody.add_geom(name=name, contype=0, conaffinity=bit, density=0)
-            for alike in (
-                "type",
-                "size",
-                "pos",
-                "quat",
-                "condim",
-                "friction",
-                "solref",
-                "solimp",
-                "solmix",
-                "priority",
-            ):
+            for alike in "type size pos quat condim friction solref solimp solmix priority margin gap".split():
                 setattr(own, alike, getattr(floor, alike))
-            own.margin, own.gap = floor.margin, floor.gap
 
     def takes(self, other: str) -> bool:
         """Whether motions of the robot named ``other`` are this one's, too: both have the same joints in one order."""

@@ -146,28 +146,32 @@ class Played(NamedTuple):
 
 
 class Player:
-    """First episodes of a trainer's robot under any disturbances, by one program for all of them.
+    """First episodes of a trainer's robot under any disturbances, by one program for those of a kind of ground.
 
     Args:
       trainer: of the run.
       episodes: per case.
       seed: of starts and disturbances, which are the same for every policy.
+      uneven: whether the ground may be uneven, too.
+
+    Raises:
+      UserError: the robot names no torso, or its world cannot be uneven.
     """
 
-    def __init__(self, trainer: Trainer, episodes: int = EPISODES, seed: int = SEED):
+    def __init__(self, trainer: Trainer, episodes: int = EPISODES, seed: int = SEED, *, uneven: bool = False):
         self.trainer, self.count = trainer, episodes
         config = trainer.config
-        # Every disturbance is on; their sizes are in the state.
+        # Every disturbance is on, but for uneven ground, which has a model of its own; their sizes are in the state.
         everything = dataclasses.replace(
             MJLAB,
             torso_mass=(0.0, 0.0),
             joint_friction=(0.0, 0.0),
             delay=(0, 2 * config.physics.substeps),
-            step_height=0.01,
+            step_height=float(uneven),
         )
         settings = dataclasses.replace(config.physics, backend="native")  # MJX does not have all of them
         everything = dataclasses.replace(config, disturbance=everything, physics=settings)
-        backend = physics.make(trainer.robot, settings, joint_friction=True, uneven=True)
+        backend = physics.make(trainer.robot, settings, joint_friction=True, uneven=uneven)
         self.env = Env(trainer.robot, trainer.library, everything, backend)
         assert self.env.disturbances is not None, "the evaluation's own configuration has every disturbance"
         self.disturbances = self.env.disturbances
@@ -244,17 +248,32 @@ def measure(
       note: called with a line after each case; None for silence.
 
     Raises:
-      UserError: the robot has no torso whose mass could differ, or stands on more than a plane, or no case has a
-        disturbance of that name.
+      UserError: the robot has no torso whose mass could differ, no case has a disturbance of that name, or uneven
+        ground is named and the robot's world cannot be.
     """
     wanted = chosen(trainer.config, disturbances)
-    player, cells = Player(trainer, episodes), []
-    for case in wanted:
-        cells.append(_cell(trainer, case, player.play(state, case.config)))
-        if note:
-            note(table(cells[-1:]))
+    cells = _played(Player(trainer, episodes), [case for case in wanted if not case.config.step_height], state, note)
+    if uneven := [case for case in wanted if case.config.step_height]:
+        try:
+            cells += _played(Player(trainer, episodes, uneven=True), uneven, state, note)
+        except UserError as error:
+            if disturbances:
+                raise
+            if note:
+                note(f"  without {uneven[0].disturbance}: {error}")
+    order = [(case.disturbance, case.size) for case in wanted]
+    cells.sort(key=lambda cell: order.index((cell.disturbance, cell.size)))
     speed = float(trainer.library.mean([planar_speed(clip) for clip in trainer.library.clips]))
     return Robustness(tuple(cells), trainer.config.env.episode_steps / trainer.config.control_rate, speed)
+
+
+def _played(player: Player, wanted: Sequence[Case], state: PPOState, note: Any) -> list[Cell]:
+    cells = []
+    for case in wanted:
+        cells.append(_cell(player.trainer, case, player.play(state, case.config)))
+        if note:
+            note(table(cells[-1:]))
+    return cells
 
 
 def _cell(trainer: Trainer, case: Case, played: Played) -> Cell:

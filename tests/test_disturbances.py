@@ -48,7 +48,7 @@ def test_presets_without_disturbances_have_none(robot, walk):
         ("damping", "-0.1,1", "damping is -0.1, 1: expected numbers of at least 0"),
         ("torso_center", "0.1", "torso_center is 0.1: expected three numbers, along x, y and z, or none"),
         ("slope", "0.6", "slope is 0.6: expected at most 0.5 rad"),
-        ("step_height", "0.3", "step_height is 0.3: expected at most 0.2 m"),
+        ("step_height", "0.3", "step_height is 0.3: expected at most 0.1 m"),
         ("delay", "4,0", "delay is 4, 0: expected two numbers, the lower one first, or none"),
         ("push_interval", "0,1", "push_interval is 0, 1: expected numbers above 0"),
     ],
@@ -181,6 +181,19 @@ def test_pushes_grow_while_episodes_survive(robot, walk):
 
 
 # --- uneven ground ---------------------------------------------------------------------------------------------------
+
+
+def test_uneven_ground_leaves_all_other_random_numbers_as_they_are(robot, walk):
+    even = built(robot, walk, **PUSHED, **{"disturbance.turn_noise": 0.1})
+    uneven = built(robot, walk, **PUSHED, **{"disturbance.turn_noise": 0.1, "disturbance.step_height": 0.02})
+    key = jax.random.PRNGKey(3)
+    np.testing.assert_array_equal(uneven.draw(key, (5, 7))[..., : even.draws], even.draw(key, (5, 7)))
+
+
+def test_uneven_ground_on_a_physics_without_it_is_refused(robot, walk):
+    config = preset("laptop", **{"disturbance.step_height": 0.02, "physics.backend": "native"})
+    with pytest.raises(UserError, match="step_height is 0.02 and the physics has even ground"):
+        Env(robot, walk, config, physics.make(robot, config.physics))
 
 
 def test_a_foot_that_is_lifted_comes_down_on_another_floor(robot, walk):

@@ -10,7 +10,7 @@ from fmpjax.errors import UserError
 
 Ends = tuple[float, ...]  # of a range, the lower one first; empty for none
 _STEEPEST = 0.5  # rad, beyond which a floor is no floor
-_HIGHEST = 0.2  # m, beyond which a step is a stair
+_HIGHEST = 0.1  # m, beyond which the shank of a foot on a low floor could touch the level
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +39,7 @@ class DisturbanceConfig(Section):
 
     # Of each footstep.
 
-    # m, highest step from one foot's floor to the other's, both of which are drawn anew [D]
+    # m, greatest difference in height between the floors of the two feet, each drawn again for every footstep [D]
     step_height: NonNegativeFloat = 0.0
 
     # Of each control step.

@@ -16,7 +16,7 @@ def make(robot: Robot, config: PhysicsConfig, *, joint_friction: bool = False, u
     floors of the feet have heights, which traits say.
 
     Raises:
-      UserError: joint friction is asked of MJX in JAX.
+      UserError: joint friction is asked of MJX in JAX, or the robot's world cannot be uneven.
     """
     backend = config.backend
     if backend == "auto":

@@ -27,7 +27,7 @@ class MjxPhysics:
     name = "mjx"
 
     def __init__(self, robot: Robot, config: PhysicsConfig, *, uneven: bool = False):
-        self.robot, self.config = robot, config
+        self.robot, self.config, self.uneven = robot, config, uneven
         limits = {}
         if robot.self_collision and config.impl == "jax":
             # MJX in JAX works on every pair of geoms at every step: of a pair of shapes' kinds the nearest are kept.
@@ -99,7 +99,7 @@ class MjxPhysics:
             if traits:
                 fields = changed(self._nominal, unpacked(traits[0]), jnp)
                 model = model.tree_replace({name: jnp.asarray(x, qpos.dtype) for name, x in fields.items()})
-                if self._nominal.uneven:  # Warp places what is fixed to the world once, when it makes the data
+                if self.uneven:  # Warp places what is fixed to the world once, when it makes the data
                     floor = np.any(self._nominal.floors, axis=1, keepdims=True)
                     data = data.replace(geom_xpos=jnp.where(floor, model.geom_pos, data.geom_xpos))
 

@@ -35,6 +35,7 @@ class NativePhysics:
     name = "native"
 
     def __init__(self, robot: Robot, config: PhysicsConfig, *, uneven: bool = False):
+        self.uneven = uneven
         self.robot, self.model = robot, _without_warmstart(model(robot, config, uneven=uneven))
         if uneven:  # MuJoCo's tree of boxes has the floors where they were compiled
             self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
@@ -106,16 +107,15 @@ class NativePhysics:
 
     def _with_traits(self, rows: np.ndarray) -> list[mujoco.MjModel]:
         """A model for each row of traits; models are kept, since all traits but the floors stay for a whole run."""
-        uneven = self._nominal.uneven
         # Where floors change, each row has a model of its own, in which they are set again for each step.
-        keys = [(i if uneven else 0, row[: -len(FLOORS)].tobytes()) for i, row in enumerate(rows)]
-        if len(self._models) > max(_KEPT, 2 * len(rows)):
+        keys = [(i if self.uneven else 0, row[: -len(FLOORS)].tobytes()) for i, row in enumerate(rows)]
+        if len(self._models) > max(_KEPT, 2 * len(rows) * jax.local_device_count()):
             self._models.clear()
         for key, row in zip(keys, rows, strict=True):
             if key not in self._models:
                 self._models[key] = self._model_of(unpacked(row.astype(np.float64)))
         models = [self._models[key] for key in keys]
-        if uneven:
+        if self.uneven:
             heights = self._nominal.fields["geom_pos"][:, 2] + rows[:, -len(FLOORS) :] @ self._nominal.floors.T
             for built, height in zip(models, heights, strict=True):
                 built.geom_pos[:, 2] = height

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from fmpjax import physics, robots
-from fmpjax.config import preset
+from fmpjax.config import disturbance, preset
 from fmpjax.errors import UserError
 from fmpjax.physics import traits
 from fmpjax.physics.traits import Traits
@@ -105,9 +106,14 @@ def test_floors_change_from_step_to_step(robot, states):
     qpos, qvel, targets = states
     backend, start = physics.make(robot, LAPTOP, uneven=True), physics.reset(qpos, qvel)
     step, own = jax.jit(backend.step), nominal_traits(robot, COUNT)
+    # One robot, floors of different heights: each row has a model of its own.
+    start, targets = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), (start, targets))
     level = step(start, targets, own)
-    raised = step(start, targets, own._replace(floors=jnp.full((COUNT, 2), 0.02)))
-    assert np.abs(np.asarray(raised.qvel - level.qvel)).max() > 0.1
+    heights = 0.005 * jnp.arange(COUNT)
+    raised = step(start, targets, own._replace(floors=jnp.stack([heights, heights], axis=1)))
+    np.testing.assert_array_equal(raised.qvel[0], level.qvel[0])
+    gaps = np.abs(np.asarray(raised.qvel[1:] - raised.qvel[:-1])).max(axis=-1)
+    assert (gaps > 0.1).all()
     for a, b in zip(level, step(start, targets, own), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -123,6 +129,50 @@ def test_a_raised_floor_bears_a_robot_above_the_level(robot):
         :, 2
     ]
     assert fell[0] < -0.15 and fell[1] > -0.1
+
+
+@pytest.mark.parametrize("name", ["unitree_g1", "unitree_g1_29dof", "strider"])
+def test_a_foot_on_the_lowest_floor_leaves_the_shank_above_the_level(name):
+    robot = robots.load(name)
+    model, data = robot.physics_model(), mujoco.MjData(robot.physics_model())
+    data.qpos[:] = robot.default_qpos
+    mujoco.mj_kinematics(model, data)
+
+    def lowest(geom):
+        rotation, size = data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
+        reach = size[0] + (
+            size[1] * abs(rotation[2, 2]) if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE else 0
+        )
+        return data.geom_xpos[geom][2] - reach
+
+    floor = model.geom("floor")
+    touch = (model.geom_contype & floor.conaffinity | model.geom_conaffinity & floor.contype) != 0
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    soles = min(lowest(i) for i in np.flatnonzero(touch) if "_foot_" in names[i])
+    others = [lowest(i) for i in np.flatnonzero(touch) if "_foot_" not in names[i] and names[i] != "floor"]
+    assert min(others) - soles > disturbance._HIGHEST / 2
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            ("<worldbody>", '<worldbody><geom name="box" type="box" size="1 1 1"/>'),
+            "a world of one plane, the floor: that",
+        ),
+        (('conaffinity="1" condim', 'conaffinity="1073741823" condim'), "three bits that no contype or conaffinity"),
+    ],
+)
+def test_a_robot_whose_ground_cannot_be_uneven_says_so(tmp_path, change, said):
+    folder = tmp_path / "mine"
+    shutil.copytree(robots.load("strider").path.parent, folder)
+    file = folder / "robot.xml"
+    assert change[0] in file.read_text()
+    file.write_text(file.read_text().replace(*change))
+    robot = robots.load(str(folder))
+    physics.make(robot, LAPTOP)
+    with pytest.raises(UserError, match=f"disturbance.step_height needs {said}"):
+        physics.make(robot, LAPTOP, uneven=True)
 
 
 @pytest.mark.parametrize("name", ["unitree_g1", "unitree_g1_29dof", "strider"])
