@@ -15,6 +15,7 @@ from fmpjax.env import Env, EnvState
 from fmpjax.errors import UserError
 from fmpjax.evaluate import episodes_of, planar_speed
 from fmpjax.ppo import PPOState
+from fmpjax.pushes import Side, by_side, pushes_of, sides_text
 from fmpjax.trainer import Trainer
 
 EPISODES = 256  # per cell
@@ -59,6 +60,7 @@ class Cell(NamedTuple):
     speed_n: int  # episodes behind it
     excursion: float  # of the demonstrations'
     excursion_n: int
+    sides: tuple[Side, ...] = ()  # where it is pushed: the pushes to each side, and the falls after them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +73,8 @@ class Robustness:
 
     def to_json(self) -> str:
         """All figures; what is not defined is null."""
-        return jsons.dumps(vars(self) | {"cells": [cell._asdict() for cell in self.cells]})
+        cells = [cell._asdict() | {"sides": [side._asdict() for side in cell.sides]} for cell in self.cells]
+        return jsons.dumps(vars(self) | {"cells": cells})
 
 
 def cases(config: Config) -> list[Case]:
@@ -273,12 +276,15 @@ def _played(player: Player, wanted: Sequence[Case], state: PPOState, note: Any) 
         cells.append(_cell(player.trainer, case, player.play(state, case.config)))
         if note:
             note(table(cells[-1:]))
+            if cells[-1].sides:
+                note(f"    {sides_text(cells[-1].sides)}")
     return cells
 
 
 def _cell(trainer: Trainer, case: Case, played: Played) -> Cell:
     rate, robot = trainer.config.control_rate, trainer.robot
-    qpos, length, fell, _ = played
+    qpos, length, fell, added = played
+    pushes = pushes_of(qpos, length, fell, added)
     low, high = wilson(int(fell.sum()), len(fell))
     speeds, _ = metrics.late_path(qpos[..., :3], rotations.yaw(qpos[..., 3:7].astype(np.float64)), length, rate=rate)
     expert = trainer.library.mean(
@@ -298,6 +304,7 @@ def _cell(trainer: Trainer, case: Case, played: Played) -> Cell:
         speed_n=speed.n,
         excursion=excursion.mean,
         excursion_n=excursion.n,
+        sides=tuple(by_side(pushes)) if pushes else (),
     )
 
 

@@ -6,15 +6,16 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from fmpjax import robustness, rotations, steering
+from fmpjax import robustness, steering
 from fmpjax.evaluate import Episodes
+from fmpjax.pushes import pushes_of
 from fmpjax.runs.folder import Run
 from fmpjax.trainer import Trainer, TrainState
 from fmpjax.viz import render
 
 _STRIDE = 2  # control steps a picture, which makes 25 pictures a second
 _SHOWN = 0.6  # s for which the picture says what has happened
-_SIDES = ("ahead", "to its left", "back", "to its right")
+_SAID = {"left": "to its left", "right": "to its right"}
 
 
 def longest(played: Episodes) -> int:
@@ -119,14 +120,12 @@ def pushed_video(
 
 def _happened(played: robustness.Played, episode: int, rate: float) -> list[str]:
     """For every step of an episode, the push of the last moments or the fall, in words."""
-    pushes, qpos = played.pushes[:, episode, :2], played.qpos[:, episode]
-    words = [""] * len(qpos)
-    for step in np.flatnonzero(pushes.any(axis=-1)):
-        heading = float(rotations.yaw(qpos[max(0, step - 1), 3:7].astype(np.float64)))
-        angle = np.arctan2(pushes[step, 1], pushes[step, 0]) - heading
-        side = _SIDES[round(angle / (np.pi / 2)) % 4]
-        until = min(len(qpos), step + round(_SHOWN * rate))
-        words[step:until] = [f"pushed {side}, {np.linalg.norm(pushes[step]):.2g} m/s"] * (until - step)
+    words = [""] * len(played.qpos)
+    one = slice(episode, episode + 1)
+    for push in pushes_of(played.qpos[:, one], played.length[one], played.fell[one], played.pushes[:, one]):
+        until = min(len(words), push.step + round(_SHOWN * rate))
+        said = f"pushed {_SAID.get(push.side, push.side)}, {push.speed:.2g} m/s"
+        words[push.step : until] = [said] * (until - push.step)
     if played.fell[episode]:
         end = int(played.length[episode])
         words[end:] = ["fell"] * (len(words) - end)

@@ -33,7 +33,7 @@ def of(cell: Cell, *, smoke: bool = False) -> Cell:
 def robust(cell: Cell, folder: Path) -> list[dict[str, Any]]:
     """A line for each disturbance and size, for a CSV file; none where they were not measured."""
     found = _read(folder / cell.name / ROBUST).get("cells", [])
-    return [_where(cell) | line for line in found]
+    return [_where(cell) | {key: value for key, value in line.items() if key != "sides"} for line in found]
 
 
 def ranking(cell: Cell, folder: Path) -> list[dict[str, Any]]:
