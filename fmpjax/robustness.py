@@ -255,15 +255,18 @@ def measure(
         ground is named and the robot's world cannot be.
     """
     wanted = chosen(trainer.config, disturbances)
-    cells = _played(Player(trainer, episodes), [case for case in wanted if not case.config.step_height], state, note)
-    if uneven := [case for case in wanted if case.config.step_height]:
+    cells: list[Cell] = []
+    for uneven in (False, True):
+        alike = [case for case in wanted if bool(case.config.step_height) == uneven]
+        if not alike:
+            continue
         try:
-            cells += _played(Player(trainer, episodes, uneven=True), uneven, state, note)
+            cells += _played(Player(trainer, episodes, uneven=uneven), alike, state, note)
         except UserError as error:
-            if disturbances:
+            if disturbances or not uneven:
                 raise
             if note:
-                note(f"  without {uneven[0].disturbance}: {error}")
+                note(f"  without {alike[0].disturbance}: {error}")
     order = [(case.disturbance, case.size) for case in wanted]
     cells.sort(key=lambda cell: order.index((cell.disturbance, cell.size)))
     speed = float(trainer.library.mean([planar_speed(clip) for clip in trainer.library.clips]))

@@ -107,6 +107,21 @@ def test_disturbances_are_chosen_by_name():
         robustness.chosen(config, ("wind",))
 
 
+def test_ground_that_cannot_be_uneven_leaves_its_cases_out_unless_they_are_named(walk, monkeypatch):
+    trainer, lines = Trainer(tiny(), walk), []
+
+    def refuse(trainer, episodes, uneven):
+        assert uneven, "no case on level ground is wanted"
+        raise UserError("no plane")
+
+    monkeypatch.setattr(robustness, "Player", refuse)
+    monkeypatch.setattr(robustness, "cases", lambda config: [c for c in robustness_cases(config) if c[0] == "steps"])
+    found = robustness.measure(trainer, trainer.shapes().ppo, episodes=2, note=lines.append)
+    assert found.cells == () and lines == ["  without steps: no plane"]
+    with pytest.raises(UserError, match="no plane"):
+        robustness.measure(trainer, trainer.shapes().ppo, episodes=2, disturbances=["steps"])
+
+
 def test_disturbances_without_their_evaluation_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit):
         cli.main(["evaluate", str(tmp_path), "--disturbances", "push"])
